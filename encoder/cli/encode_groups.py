@@ -31,9 +31,9 @@ from kpc.format.scene.scene import Clip
 from kpc.format.scene.space import Contraction
 
 # Figures that are reported for each group.
-GROUP_FIGURES = ("size_bytes", "test_psnr", "steps", "train_s", "peak_memory_bytes")
+GROUP_FIGURES = ("size_bytes", "test_psnr", "steps", "train_s", "coding_s", "peak_memory_bytes")
 # Figures that are summed over all groups.
-SUMMED_FIGURES = ("test_pictures", "held_out_pictures", "steps", "train_s")
+SUMMED_FIGURES = ("test_pictures", "held_out_pictures", "steps", "train_s", "coding_s")
 
 
 def encode_groups(options: Options) -> dict[str, Any]:
@@ -137,6 +137,8 @@ def _read_finished(path: Path, options: Options) -> dict[str, Any]:
                 "--resume"
             )
         found: dict[str, Any] = kept["found"]
+        if missing := {*GROUP_FIGURES, *SUMMED_FIGURES, "test_psnr_moving"} - found.keys():
+            raise KeyError(*missing)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainingError(f"{path}: its figures cannot be read; delete it to have the group encoded anew") from error
     log(f"{path}: is finished already")
@@ -165,8 +167,9 @@ def _combine(
     """Combine the figures of all groups: sums, means over frames or pictures, and those of each group."""
 
     def mean(name: str, weights: Sequence[float]) -> float | None:
-        values = [one[name] for one in found]
-        return None if None in values or not sum(weights) else float(np.average(values, weights=weights))
+        known = [(one[name], weight) for one, weight in zip(found, weights, strict=True) if one[name] is not None]
+        values, shares = [value for value, _ in known], [weight for _, weight in known]
+        return float(np.average(values, weights=shares)) if sum(shares) else None
 
     pictures = [one["test_pictures"] for one in found]
     return (
@@ -176,6 +179,8 @@ def _combine(
             "file": str(options.output),
             "test_psnr": mean("test_psnr", pictures),
             "test_ssim": mean("test_ssim", pictures),
+            "test_psnr_moving": mean("test_psnr_moving", pictures),
+            "test_psnr_still": mean("test_psnr_still", pictures),
             "coding_loss_db": mean("coding_loss_db", [span.count for span in spans]),
             **{key: sum(one[key] for one in found) for key in SUMMED_FIGURES},
             "rays_per_s": mean("rays_per_s", [one["train_s"] for one in found]),

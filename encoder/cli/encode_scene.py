@@ -28,6 +28,7 @@ from kpc.encoder.rdo.codec_model import CodedModel, Model, code
 from kpc.encoder.rdo.model_checkpoint import save_checkpoint
 from kpc.encoder.rdo.sequential_finetune import steps_per_group
 from kpc.encoder.training.train import Report, Trainer
+from kpc.format.common.compiling import working_s
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.common.progress import Progress
 from kpc.format.container import scene_io
@@ -63,11 +64,13 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     scene, pictures = to_scene(trainer), _select_cameras(dataset)
     metadata = describe(options, dataset, scene, pictures, setting.dataset_sha256 or hash_dataset(dataset))
     scene = replace(scene, metadata=metadata)
+    coding_from_s = working_s()
     coded = _code(trainer, scene, reserve_figures(options))
+    coding_s = working_s() - coding_from_s
     save_scene(coded.data, options.output, work)
     decoded = scene_io.read(options.output).dequantise()
     most = _most_tested(options, SceneRenderer(decoded), trainer)
-    test = evaluate(decoded, dataset, most=most, label="testing the coded file")
+    test = evaluate(decoded, dataset, most=most, label="testing the coded file", parts=True)
     uncoded = evaluate(scene, dataset, most=most, label="testing the model")
     figures = {
         **_test_figures(test, dataset),
@@ -92,6 +95,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         **coding_figures(coded, size, options.trade, "training views"),
         "steps": trainer.step,
         "train_s": trainer.elapsed_s,
+        "coding_s": coding_s,
         "encode_s": time.monotonic() - started,
         "rays_per_s": trainer.rays_per_second,
         "peak_memory_bytes": peak_memory_bytes(),
@@ -113,6 +117,8 @@ def _test_figures(test: Quality | None, dataset: Dataset) -> dict[str, Any]:
     return {
         "test_psnr": test and test.psnr,
         "test_ssim": test and test.ssim,
+        "test_psnr_moving": test and test.moving_psnr,
+        "test_psnr_still": test and test.still_psnr,
         "test_pictures": test.pictures if test else 0,
         "held_out_pictures": int(dataset.pictures.is_test.sum()),
     }
@@ -144,7 +150,7 @@ def _evaluate_unwritable(trainer: Trainer, options: Options, started: float) -> 
     """Return what was measured on a model that no file can hold; fewer figures than `encode_scene` returns."""
     scene = to_scene(trainer)
     most = _most_tested(options, SceneRenderer(scene, trainer.field), trainer)
-    test = evaluate(scene, trainer.dataset, most=most, field=trainer.field, label="testing the model")
+    test = evaluate(scene, trainer.dataset, most=most, field=trainer.field, label="testing the model", parts=True)
     if not options.keep:
         clear_work_folder(options.work_dir)
     return {

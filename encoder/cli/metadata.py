@@ -86,8 +86,8 @@ def with_figures(metadata: Metadata, result: Mapping[str, Any]) -> Metadata:
         "pictures": result["test_pictures"],
         "psnr_db": result["test_psnr"],
         "ssim": result["test_ssim"],
-        "moving_psnr_db": result.get("test_psnr_moving"),
-        "still_psnr_db": result.get("test_psnr_still"),
+        "moving_psnr_db": result["test_psnr_moving"],
+        "still_psnr_db": result["test_psnr_still"],
     }
     known = {name: rounded([value])[0] for name, value in held_out.items() if value is not None and np.isfinite(value)}
     loss = result["coding_loss_db"]

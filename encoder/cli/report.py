@@ -104,8 +104,8 @@ def _print_encode(result: dict[str, Any], options: Options) -> None:
     quality, tested = "no view held out", result["test_psnr"] is not None
     if tested:
         quality = (
-            f"held-out PSNR {result['test_psnr']:.2f} dB, SSIM {result['test_ssim']:.4f} "
-            f"over {result['test_pictures']} of {result['held_out_pictures']} pictures"
+            f"held-out PSNR {result['test_psnr']:.2f} dB{_describe_parts(result)}, SSIM {result['test_ssim']:.4f} over "
+            f"{result['test_pictures']} of {result['held_out_pictures']} pictures"
         )
         if result["appearances"]:
             quality += ", right halves, each in an appearance fitted to its left half"
@@ -120,8 +120,19 @@ def _print_encode(result: dict[str, Any], options: Options) -> None:
     if len(result.get("groups", [])) > 1:
         print(f"{len(result['groups'])} groups: " + ", ".join(_describe_group(group) for group in result["groups"]))
     print(
-        f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps)"
+        f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps) "
+        f"and coding {result['coding_s']:.0f} s"
     )
+    if result["coding_s"] > result["train_s"]:
+        parameters = f"{result['parameters']:,} parameters"
+        print(f"coding took longer than training: however few the steps are, all {parameters} are coded")
+
+
+def _describe_parts(result: dict[str, Any]) -> str:
+    """Describe the PSNR of moving and still pixels, where anything is known to move."""
+    if result["test_psnr_moving"] is None:
+        return ""
+    return f" (moving {result['test_psnr_moving']:.2f}, still {result['test_psnr_still']:.2f})"
 
 
 def _describe_group(group: dict[str, Any]) -> str:

@@ -7,6 +7,8 @@ import torch
 from torch.nn.functional import conv2d
 
 from kpc.encoder.datasets import Dataset, Pictures, pixel_rays
+from kpc.encoder.evaluation.ground_truth import ground_truth
+from kpc.encoder.evaluation.moving import MovingPixels
 from kpc.encoder.field.appearances import FIT_RAYS, fit_code
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import count_samples, march_scene, render_rays
@@ -16,7 +18,6 @@ from kpc.format.common.progress import progress
 from kpc.format.scene.scene import AnyDecoder, Decoder, Scene
 from kpc.format.scene.space import Contraction
 
-WHITE = np.ones(3, np.float32)
 RAYS_AT_ONCE = 1 << 16  # bounds the memory of rendering
 
 
@@ -170,11 +171,21 @@ def _pad_axis(values: np.ndarray, axis: int, size: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Quality:
-    """Means over the pictures that were compared: PSNR in dB, SSIM, and their number."""
+    """Means over the pictures that were compared.
+
+    Attributes:
+        psnr: of all pixels, dB.
+        ssim: of all pixels.
+        pictures: how many.
+        moving_psnr, still_psnr: of the pixels that move and of the others, dB, over pictures that have any; None where
+            that was not measured, or nothing is known to move.
+    """
 
     psnr: float
     ssim: float
     pictures: int
+    moving_psnr: float | None = None
+    still_psnr: float | None = None
 
 
 def evaluate(
@@ -184,6 +195,7 @@ def evaluate(
     most: int | None = None,
     field: Field | None = None,
     label: str | None = None,
+    parts: bool = False,
 ) -> Quality | None:
     """Return the mean PSNR and SSIM over held-out pictures; None where none are held out.
 
@@ -200,27 +212,37 @@ def evaluate(
         most: at most this many pictures, chosen by `spread_evenly`.
         field: as for `SceneRenderer`.
         label: name of the task, to show progress; None to show nothing.
+        parts: whether to measure moving and still pixels apart, too.
     """
     held_out = testable_pictures(dataset, right_halves=bool(scene.appearances))
     if len(held_out) == 0:
         return None
     if most is not None:
         held_out = spread_evenly(dataset.pictures, held_out, most)
-    renderer = SceneRenderer(scene, field)
-    scores = []
+    renderer, moving = SceneRenderer(scene, field), MovingPixels(dataset)
+    scores: list[tuple[float, float]] = []
+    moving_psnr: list[float] = []
+    still_psnr: list[float] = []
     for number in progress(held_out.tolist(), label or "", unit="pictures", shown=label is not None):
         start, code = 0, None
         if scene.appearances:
             start, code = _middle(dataset, number), renderer.fit_left_half(dataset, number)
         picture = np.clip(renderer.picture(dataset, number, start, code), 0, 1)
         truth = ground_truth(dataset, number)[:, start:]
+        usable = np.ones(truth.shape[:2], bool) if dataset.masks is None else dataset.usable(number)[:, start:]
         if dataset.masks is None:
             scores.append((psnr(picture, truth), ssim(picture, truth)))
         else:
-            usable = dataset.usable(number)[:, start:]
             scores.append((psnr(picture[usable], truth[usable]), ssim(picture, truth, usable)))
+        if parts and (mask := moving.mask(number)) is not None:
+            for found, of_part in ((moving_psnr, mask[:, start:]), (still_psnr, ~mask[:, start:])):
+                if (chosen := of_part & usable).any():
+                    found.append(psnr(picture[chosen], truth[chosen]))
     mean_psnr, mean_ssim = np.mean(scores, axis=0)
-    return Quality(float(mean_psnr), float(mean_ssim), len(scores))
+    quality = Quality(float(mean_psnr), float(mean_ssim), len(scores))
+    if not moving_psnr or not still_psnr:
+        return quality
+    return replace(quality, moving_psnr=float(np.mean(moving_psnr)), still_psnr=float(np.mean(still_psnr)))
 
 
 def testable_pictures(dataset: Dataset, right_halves: bool) -> np.ndarray:
@@ -267,14 +289,6 @@ def spread_evenly(pictures: Pictures, numbers: np.ndarray, count: int) -> np.nda
 def _middle(dataset: Dataset, number: int) -> int:
     """Return the first column of a picture's right half."""
     return int(dataset.pictures.width[number]) // 2
-
-
-def ground_truth(dataset: Dataset, number: int) -> np.ndarray:
-    """Return a picture of the dataset as (H, W, 3) float32 in [0, 1], on white where it is transparent."""
-    picture = dataset.pixels.picture(number).astype(np.float32) / np.float32(255)
-    if dataset.has_alpha:
-        return picture[..., :3] * picture[..., 3:] + WHITE * (1 - picture[..., 3:])
-    return picture[..., :3]
 
 
 def ssim(a: np.ndarray, b: np.ndarray, usable: np.ndarray | None = None) -> float:

@@ -8,7 +8,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from kpc.encoder.datasets import Dataset, pixel_rays
-from kpc.encoder.evaluation.evaluate import SceneRenderer, ground_truth
+from kpc.encoder.evaluation.evaluate import SceneRenderer
+from kpc.encoder.evaluation.ground_truth import ground_truth
+from kpc.encoder.evaluation.moving import MovingPixels
 from kpc.encoder.training.train import Trainer
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.fidelity import psnr
@@ -17,9 +19,6 @@ from kpc.format.scene.space import DeviceCoordinates
 SIDE = 320  # pixels of the longer side of either picture, at most
 EVERY_S, AT_MOST_S = 10.0, 60.0  # seconds between two previews, at least and at most
 SHARE = 0.05  # of the time that previews may take, within these bounds
-MEDIAN_PICTURES = 31  # of a camera, at most, whose median over time shows what moves
-MOVING = 0.04  # difference from the median, as a share of the range in one channel, from which on a pixel moves
-GROWTH = 3  # pixels by which moving regions are grown
 CAPTION_HEIGHT = 14
 BOX_COLOUR = (255, 200, 0)
 
@@ -44,8 +43,9 @@ class Preview:
         same = same[np.argsort(pictures.time[same], kind="stable")]
         self.number = int(same[len(same) // 2])
         self.stride = -(-int(max(pictures.width[self.number], pictures.height[self.number])) // SIDE)
-        self.truth = self._filmed(self.number)
-        self.moving = self._find_moving(same)
+        self.truth = ground_truth(dataset, self.number)[:: self.stride, :: self.stride]
+        mask = MovingPixels(dataset, self.stride).mask(self.number)
+        self.moving = np.zeros(self.truth.shape[:2], bool) if mask is None else mask
         self._due = 0.0
 
     def update(self, trainer: Trainer, step: int) -> None:
@@ -79,36 +79,12 @@ class Preview:
         values = [f"{name} {psnr(drawn[mask], self.truth[mask]):.1f} dB" for name, mask in parts.items() if mask.any()]
         return ", ".join([f"step {step:,}", *values])
 
-    def _filmed(self, number: int) -> np.ndarray:
-        return ground_truth(self.dataset, number)[:: self.stride, :: self.stride]
-
-    def _find_moving(self, numbers: np.ndarray) -> np.ndarray:
-        """Return (H, W) bool, the pixels that differ from their median over a camera's pictures, grown."""
-        if len(numbers) < 3:
-            return np.zeros(self.truth.shape[:2], bool)
-        some = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), MEDIAN_PICTURES)).round().astype(int)]
-        return moving_pixels(self.truth, np.stack([self._filmed(int(number)) for number in some]))
-
     def _render(self, renderer: SceneRenderer) -> np.ndarray:
         height, width = self.truth.shape[:2]
         row, column = (self.stride * index for index in np.divmod(np.arange(height * width), width))
         pictures, number = self.dataset.pictures, np.full(height * width, self.number)
         origins, directions = pixel_rays(pictures, number, column, row, renderer.scene.mapping)
         return renderer.rgb(origins, directions, pictures.time[number]).reshape(height, width, 3)
-
-
-def moving_pixels(picture: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return (H, W) bool: where a picture differs by more than MOVING from the median of others, grown by GROWTH.
-
-    Args:
-        picture: (H, W, 3) in [0, 1].
-        others: (N, H, W, 3), pictures of the same camera at other times.
-    """
-    moving = (np.abs(picture - np.median(others, axis=0)) > MOVING).any(axis=-1)
-    padded = np.pad(moving, GROWTH)
-    size = 2 * GROWTH + 1
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size))
-    return np.asarray(windows.any(axis=(2, 3)))
 
 
 def box_edges(dataset: Dataset, number: int, aabb: np.ndarray, stride: int) -> list[list[tuple[float, float]]]:

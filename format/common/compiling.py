@@ -7,8 +7,7 @@ on terminals, and elsewhere for commands that say so (`CompilationMonitor.announ
 import sys
 import threading
 import time
-
-from numba.core import event
+from typing import Any
 
 NOTICE = "compiling kernels for this processor, which takes a minute or two, once"
 
@@ -16,7 +15,7 @@ NOTICE = "compiling kernels for this processor, which takes a minute or two, onc
 NOTICE_AFTER_S = 1.0
 
 
-class CompilationMonitor(event.Listener):
+class CompilationMonitor:
     """Measures how long numba compiles, and prints NOTICE once on a terminal. Compilations may nest."""
 
     def __init__(self) -> None:
@@ -26,7 +25,7 @@ class CompilationMonitor(event.Listener):
         self._notified = False
         self.announces = False  # whether to print NOTICE where stderr is no terminal, too
 
-    def on_start(self, _: event.Event) -> None:
+    def on_start(self, _: Any) -> None:
         """Record that numba begins to compile a function."""
         with self._lock:
             if self._depth == 0:
@@ -38,7 +37,7 @@ class CompilationMonitor(event.Listener):
         if notify:
             print(NOTICE, file=sys.stderr)
 
-    def on_end(self, _: event.Event) -> None:
+    def on_end(self, _: Any) -> None:
         """Record that numba is done with a function."""
         with self._lock:
             self._depth -= 1
@@ -60,6 +59,20 @@ class CompilationMonitor(event.Listener):
 MONITOR = CompilationMonitor()
 
 
+def working_s() -> float:
+    """Return the seconds of a clock that stands still while numba compiles."""
+    return time.monotonic() - MONITOR.spent_s
+
+
 def register() -> None:
     """Have numba report its compilations to MONITOR."""
-    event.register("numba:compile", MONITOR)
+    from numba.core import event  # here, so that what shows progress need not load numba
+
+    class Listener(event.Listener):  # type: ignore[misc]
+        def on_start(self, event: event.Event) -> None:
+            MONITOR.on_start(event)
+
+        def on_end(self, event: event.Event) -> None:
+            MONITOR.on_end(event)
+
+    event.register("numba:compile", Listener())

@@ -5,14 +5,26 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Sized
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from tqdm import tqdm
+
+from kpc.format.common.compiling import working_s
 
 T = TypeVar("T")
 
 # Seconds before the first lines, and between later ones, where stderr is not a terminal.
 FIRST_LINE_S, LINE_EVERY_S = 1.0, 10.0
+
+
+class _Bar(tqdm):
+    """A bar that shows the remaining time of `Progress` as `left`."""
+
+    left = "?"
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        return {**super().format_dict, "left": self.left}
 
 
 class Progress:
@@ -34,20 +46,22 @@ class Progress:
         self.done, self.text = 0.0, ""
         self.reported_at, self.line_after_s = time.monotonic(), FIRST_LINE_S
         # Units done and the time at the first call of `advance`. The remaining time is estimated from there on, since
-        # before it kernels are compiled and caches filled.
+        # before it caches are filled. The time of compiling kernels never counts.
         self.first: tuple[float, float] | None = None
-        self.bar = None
+        self.bar: _Bar | None = None
         if shown and sys.stderr.isatty():
             count = "" if unit == "%" else " {n:.0f}/{total:.0f}"  # the bar begins with the percentage
-            layout = f"{{l_bar}}{{bar}}|{count} [{{elapsed}}<{{remaining}}]{{postfix}}" if total else None
-            self.bar = tqdm(total=total, desc=label, unit=unit or "it", leave=False, file=sys.stderr, bar_format=layout)
+            layout = f"{{l_bar}}{{bar}}|{count} [{{elapsed}}<{{left}}]{{postfix}}" if total else None
+            self.bar = _Bar(total=total, desc=label, unit=unit or "it", leave=False, file=sys.stderr, bar_format=layout)
 
     def advance(self, count: float = 1) -> None:
         """Record that `count` more units are done."""
         self.done += count
         self.extend(0)  # tqdm cannot show more than the total
-        self.first = self.first or (self.done, time.monotonic())
+        self.first = self.first or (self.done, working_s())
         if self.bar is not None:
+            left_s = self._left_s()
+            self.bar.left = "?" if left_s is None else tqdm.format_interval(left_s)
             self.bar.update(count)
         elif self.shown and time.monotonic() - self.reported_at >= self.line_after_s:
             self._print_line()
@@ -82,11 +96,17 @@ class Progress:
         else:
             of = "" if self.unit == "%" else f"/{self.total:.0f}"
             parts = [f"{self.label}: {self.done:.0f}{of} {self.unit}".rstrip()]
-            done, when = self.first or (0.0, self.reported_at)
-            if self.done > done:
+            if (left_s := self._left_s()) is not None:
                 self.line_after_s = LINE_EVERY_S
-                parts.append(f"{(self.reported_at - when) * (self.total - self.done) / (self.done - done):.0f} s left")
+                parts.append(f"{left_s:.0f} s left")
         print(", ".join(parts + ([self.text] if self.text else [])), file=sys.stderr, flush=True)
+
+    def _left_s(self) -> float | None:
+        """Return the seconds that remain; None while they cannot be estimated."""
+        if not self.total or self.first is None or self.done <= self.first[0]:
+            return None
+        done, when = self.first
+        return (working_s() - when) * (self.total - self.done) / (self.done - done)
 
 
 def progress(

@@ -77,6 +77,11 @@ class Metadata:
         """The names of the scene's cameras, in their order; empty if they are not known."""
         return tuple(self.document.get("camera_names", ()))
 
+    def names_of(self, cameras: int) -> tuple[str, ...]:
+        """Return a name for each camera of a rig, their numbers from 0 on where the file does not name them all."""
+        names = self.camera_names
+        return names if len(names) == cameras else tuple(str(number) for number in range(cameras))
+
     @property
     def provenance(self) -> Mapping[str, Any]:
         """How the file was made; empty if that is not known."""

@@ -90,7 +90,8 @@ def _parser() -> argparse.ArgumentParser:
         type=cli.byte_count,
         default=DEFAULT_BUDGET,
         metavar="500MB",
-        help="limit for the scene, in main memory and on the graphics card together (default: %(default)s bytes)",
+        help="limit for the scene, in main memory and on the graphics card together (default: "
+        f"{DEFAULT_BUDGET / 1e9:.3g}GB)",
     )
     parser.add_argument(
         "--quality",

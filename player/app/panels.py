@@ -166,7 +166,7 @@ class Panels:
     def _viewpoints(self) -> None:
         """The cameras of the scene, and the named viewpoints."""
         state = self.state
-        cameras = ["-", *(str(number + 1) for number in range(len(state.rig.cameras)))]
+        cameras = ["-", *state.metadata.names_of(len(state.rig.cameras))]
         present = state.camera_number + 1 if state.shown is Shown.CAMERA else 0
         chosen = choice("camera", present, dict(enumerate(cameras)))
         if chosen not in (0, present):

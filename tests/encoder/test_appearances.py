@@ -13,7 +13,8 @@ import datasets as make
 from gradients import random_rays, translucent_scene
 from kpc.encoder.cli import encode_scene
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, ssim
+from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ssim
+from kpc.encoder.evaluation.ground_truth import ground_truth
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field import appearances
 from kpc.encoder.field.appearances import assign_appearances, choose_appearance, fit_code

@@ -9,7 +9,8 @@ import pytest
 
 import datasets as make
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, spread_evenly, ssim
+from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, spread_evenly, ssim
+from kpc.encoder.evaluation.ground_truth import ground_truth
 from kpc.encoder.evaluation.testing_time import FEWEST_PICTURES, affordable_pictures, picture_seconds
 from kpc.format.common.fidelity import psnr
 from kpc.format.scene.scene import Scene

@@ -66,8 +66,10 @@ def test_the_hash_of_a_dataset_is_that_of_its_files_and_cameras(dataset: Dataset
 
 def test_figures_are_added_and_leave_room_in_a_target_size() -> None:
     result = {"test_pictures": 2, "test_psnr": 30.123456789, "test_ssim": 0.9, "coding_loss_db": float("nan")}
+    result |= {"test_psnr_moving": 25.5, "test_psnr_still": None}
     found = with_figures(Metadata(FULL), result).provenance
-    assert found["held_out"] == {"pictures": 2, "psnr_db": 30.12346, "ssim": 0.9} and "coding_loss_db" not in found
+    assert found["held_out"] == {"pictures": 2, "psnr_db": 30.12346, "ssim": 0.9, "moving_psnr_db": 25.5}
+    assert "coding_loss_db" not in found
     assert "held_out" not in with_figures(Metadata(FULL), result | {"test_pictures": 0}).provenance
     asked = Options(Path("a"), Path("b"), trade=Trade(target_bytes=1000))
     assert reserve_figures(asked).trade.target_bytes == 800

@@ -15,7 +15,8 @@ import datasets as make
 from datasets import fails, load
 from kpc.encoder.datasets import Dataset, pixel_cache
 from kpc.encoder.datasets.masks import BLOCK
-from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, ssim
+from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ssim
+from kpc.encoder.evaluation.ground_truth import ground_truth
 from kpc.encoder.training.sampler import RaySampler
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.images import write_image

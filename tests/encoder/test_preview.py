@@ -6,20 +6,10 @@ import numpy as np
 
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation import preview as module
-from kpc.encoder.evaluation.evaluate import ground_truth
-from kpc.encoder.evaluation.preview import BOX_COLOUR, CAPTION_HEIGHT, Preview, box_edges, moving_pixels
+from kpc.encoder.evaluation.ground_truth import ground_truth
+from kpc.encoder.evaluation.preview import BOX_COLOUR, CAPTION_HEIGHT, Preview, box_edges
 from kpc.format.common.images import read_image
 from training_runs import trainer
-
-
-def test_moving_pixels_differ_from_the_median_and_are_grown() -> None:
-    others = np.full((5, 20, 30, 3), 0.5, np.float32)
-    picture = others[0].copy()
-    picture[8, 10, 1] += 0.05
-    picture[15, 25] += 0.03
-    expected = np.zeros((20, 30), bool)
-    expected[5:12, 7:14] = True
-    np.testing.assert_array_equal(moving_pixels(picture, others), expected)
 
 
 def test_a_preview_shows_the_scene_beside_the_truth(moving: Dataset, tmp_path: Path) -> None:

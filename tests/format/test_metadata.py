@@ -146,3 +146,8 @@ def test_arbitrary_bytes_are_read_or_refused(raw):
             parse_metadata(content)
         except FormatError as error:
             assert str(error).isprintable()
+
+
+def test_cameras_without_names_have_numbers() -> None:
+    named = Metadata({"camera_names": ["left", "right"]})
+    assert named.names_of(2) == ("left", "right") and named.names_of(3) == ("0", "1", "2")

@@ -6,7 +6,9 @@ import sys
 
 import pytest
 
+from kpc.format.common import compiling
 from kpc.format.common import progress as module
+from kpc.format.common.compiling import CompilationMonitor
 from kpc.format.common.progress import Progress, progress
 
 
@@ -21,6 +23,7 @@ class Clock:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
     monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(compiling, "time", clock)
     return clock
 
 
@@ -47,6 +50,17 @@ def test_time_before_the_first_unit_is_not_extrapolated(clock: Clock, capsys: py
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "train: 1/1000" and len(lines) == 3
     assert all(re.fullmatch(r"train: (11|12|111|112)/1000, (99|89) s left", line) for line in lines[1:])
+
+
+def test_compiling_is_not_extrapolated(
+    clock: Clock, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Progress("train", 100) as bar:
+        bar.advance()
+        clock.now = 42.0
+        monkeypatch.setattr(CompilationMonitor, "spent_s", 40.0)
+        bar.advance()
+    assert capsys.readouterr().err == "train: 2/100, 196 s left\n"
 
 
 def test_without_a_total(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from kpc.format.common.errors import DisplayError
 from kpc.format.common.images import read_image
 from kpc.format.container.scene_io import write
 from kpc.format.scene.cameras import load_views
+from kpc.format.scene.metadata import Metadata, camera_document
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
 from kpc.player.gl import offscreen
@@ -52,6 +54,24 @@ def test_pictures_from_a_camera_file(run, scene_file: Path, tmp_path: Path, back
     for n, name in enumerate(("one.png", "two.png")):
         wanted = reference.render(scene, tiny_scene(4).cameras[n], float(n)).rgb
         assert np.mean(np.abs(read_image(out / name) / 255 - wanted).max(axis=2) < 1.5 / 255) > 0.999
+
+
+def test_without_a_camera_the_scene_shows_its_opening_view(run, tmp_path: Path) -> None:
+    scene, path = tiny_scene(4), tmp_path / "scene.kpc"
+    camera = replace(scene.cameras[1], width=20, height=15)
+    names = ["left", "right"]
+    members = {"opening": {"camera": camera_document(camera), "time": 0.25}, "camera_names": names}
+    scene = replace(scene, metadata=Metadata(members))
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]), path)
+    assert run(path, "--time", 0, "--backend", "reference", "-o", tmp_path / "a.png")[0] == 0
+    wanted = reference.render(kpc.load(path), camera, 0.0).rgb
+    np.testing.assert_allclose(read_image(tmp_path / "a.png") / 255, wanted, atol=1.5 / 255)
+    still = (path, "--time", 0, "--size", "8x6", "--backend", "reference", "-o")
+    assert run(*still, tmp_path / "b.png", "--camera", "right")[0] == 0
+    assert run(*still, tmp_path / "c.png", "--camera", 1)[0] == 0
+    assert (tmp_path / "b.png").read_bytes() == (tmp_path / "c.png").read_bytes()
+    code, _, err = run(*still, tmp_path / "d.png", "--camera", "up")
+    assert code == 2 and "--camera up: neither a file nor a camera of the scene, which has left to right" in err
 
 
 def test_names_from_a_camera_file_stay_in_the_directory(run, scene_file: Path, tmp_path: Path) -> None:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from kpc.encoder.datasets import Dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer, ground_truth
+from kpc.encoder.evaluation.evaluate import SceneRenderer
+from kpc.encoder.evaluation.ground_truth import ground_truth
 from kpc.encoder.rdo.codec_model import widen_single_texels
 from kpc.format.common.fidelity import psnr
 from kpc.format.container import scene_io

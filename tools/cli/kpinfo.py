@@ -67,7 +67,7 @@ def _parser() -> argparse.ArgumentParser:
         type=cli.byte_count,
         default=DEFAULT_BUDGET,
         metavar="500MB",
-        help="limit for a scene, or a group of a clip in groups (default: %(default)s bytes)",
+        help=f"limit for a scene, or a group of a clip in groups (default: {DEFAULT_BUDGET / 1e9:.3g}GB)",
     )
     return parser
 

@@ -1,6 +1,6 @@
 """kprender: render pictures and films of a scene without a window.
 
-    kprender scene.kpc -o clip.mp4                            the clip, from the scene's first camera
+    kprender scene.kpc -o clip.mp4                            the clip, from the view that it opens with
     kprender scene.kpc --orbit 96 -o orbit.mp4                a path around the scene while the clip plays
     kprender scene.kpc --cameras cameras.json -o DIR          one picture for each frame that the file lists
     kprender scene.kpc --path path.json -o flight.mp4         a smooth path through the views that the file lists

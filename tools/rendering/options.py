@@ -70,9 +70,9 @@ def _add_cameras(group: argparse._ArgumentGroup) -> None:
     cameras = group.add_mutually_exclusive_group()
     cameras.add_argument(
         "--camera",
-        metavar="N|JSON",
-        help="a fixed camera: number N of the scene's, from 0 on, or the one that such a file as for --cameras lists "
-        "(default: 0)",
+        metavar="N|NAME|JSON",
+        help="a fixed camera: one of the scene's by its number from 0 on or its name, or the one that such a file as "
+        "for --cameras lists (default: the view that the file opens with, or else 0)",
     )
     cameras.add_argument(
         "--cameras",

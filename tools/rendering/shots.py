@@ -168,14 +168,24 @@ def _orbit(scene: Scene, options: argparse.Namespace) -> list[View]:
 
 
 def _camera(scene: Scene, options: argparse.Namespace) -> Camera:
-    """Return the fixed camera that --camera names: a number among the scene's, or a file that lists one view."""
+    """Return the fixed camera that --camera chooses: a number or a name of the scene's, or a file that lists one view.
+
+    Without, it is the view that the scene opens with.
+    """
     if options.camera is None:
-        return Rig.of(scene).cameras[0]
+        opening = scene.metadata.opening
+        return Rig.of(scene).cameras[0] if opening is None else opening.camera
+    cameras = Rig.of(scene).cameras
+    names = scene.metadata.names_of(len(cameras))
     if options.camera.isdecimal():
-        cameras = Rig.of(scene).cameras
         if int(options.camera) >= len(cameras):
             raise UsageError(f"--camera {options.camera}: the scene has the cameras 0 to {len(cameras) - 1}")
         return cameras[int(options.camera)]
+    if options.camera in names:
+        return cameras[names.index(options.camera)]
+    if not Path(options.camera).exists():
+        known = f"{names[0]} to {names[-1]}" if len(names) > 1 else names[0]
+        raise UsageError(f"--camera {options.camera}: neither a file nor a camera of the scene, which has {known}")
     views = load_views(Path(options.camera))
     if len(views) != 1:
         raise UsageError(f"--camera {options.camera}: lists {len(views)} views, not one; --cameras renders each")
