@@ -80,7 +80,7 @@ def plan_groups(options: Options, clip: Clip) -> tuple[groups.Span, ...]:
     group_s = float(options.group_s or 0)
     spans = split_into_spans(clip, group_s)
     if len(spans) == 1:
-        log(f"--group {group_s:g}s: the clip lasts {clip.frame_count / clip.fps:.3g} s, so it is a single group")
+        log(f"--group {group_s:g}s: the clip lasts {clip.total_s:.3g} s, so it is a single group")
     return spans
 
 

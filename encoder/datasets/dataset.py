@@ -152,7 +152,7 @@ class Dataset:
         if self.is_dynamic:
             clip = self.clip
             frames = _count(clip.frame_count, "frame")
-            parts.append(f"dynamic, {frames} at {clip.fps:.5g} fps ({clip.duration_s:.4g} s)")
+            parts.append(f"dynamic, {frames} at {clip.fps:.5g} fps ({clip.total_s:.4g} s)")
             if self.is_monocular:
                 parts.append("monocular")
         else:

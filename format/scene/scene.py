@@ -62,6 +62,11 @@ class Clip:
         """Seconds from the first frame to the last."""
         return (self.frame_count - 1) / self.fps if self.frame_count > 1 else 0.0
 
+    @property
+    def total_s(self) -> float:
+        """Seconds for which all frames are shown, the last one as long as the others."""
+        return self.frame_count / self.fps
+
 
 @dataclass(frozen=True)
 class Decoder:

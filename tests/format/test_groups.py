@@ -191,7 +191,7 @@ def test_joined_groups_are_sorted(scenes, tmp_path, capsys):
     assert (
         kpjoin.main([*(str(tmp_path / f"{number}.kpc") for number in (2, 0, 1)), "-o", str(tmp_path / "long.kpc")]) == 0
     )
-    assert "3 groups, 30 frames at 10 fps" in capsys.readouterr().out
+    assert "3 groups, 30 frames at 10 fps, 3.00 s" in capsys.readouterr().out
     joined = Groups(tmp_path / "long.kpc")
     assert joined.timeline.spans == (Span(40, 11), Span(48, 11), Span(59, 11))
     assert [joined.source_of(number).read_at(0, 1 << 20) for number in range(3)] == scenes

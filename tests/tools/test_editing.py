@@ -218,12 +218,13 @@ def clip(tmp_path):
     return tmp_path / "clip.kpc"  # 29 frames at 10 fps; two groups share two frames
 
 
-def test_groups_are_placed_retimed_and_cut(clip):
+def test_groups_are_placed_retimed_and_cut(clip, capsys):
     out = clip.with_name("out.kpc")
     command = ["--from", "1.2s", "--to", "2.5s", "--fps", "20", "--scale", "2", "--box", "-0.4,-0.8,-0.6,0.6,0.5,0.4"]
     assert kpedit.main([str(clip), "-o", str(out), *command]) == 0
     opened, whole = groups.Groups(out), groups.Groups(clip)
     assert [(s.start, s.count) for s in opened.timeline.spans] == [(18, 21), (36, 21)] and opened.clip.fps == 20
+    assert f" s of the clip, {opened.clip.frame_count} frames at 20 fps\n" in capsys.readouterr().out
     one = read(opened.open(0))
     assert one.aabb == pytest.approx(2 * read(whole.open(1)).aabb) and opened.metadata().view_limits.reach == 1.5
     assert "from 1.2, to 2.5, box" in opened.metadata().provenance["history"][-1]

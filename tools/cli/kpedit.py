@@ -55,7 +55,11 @@ def _command(argv: list[str]) -> None:
         size, kept_s = save(with_metadata(options.scene, metadata), options.output), None
     else:
         size, kept_s = edit(options.scene, options.output, edits, metadata)
-    part = "" if kept_s is None else f", {kept_s[0]:.3f} to {kept_s[1]:.3f} s of the clip"
+    part = ""
+    if kept_s is not None:
+        clip = Groups(options.output).clip
+        frames = f"{clip.frame_count} frames at {clip.fps:g} fps"
+        part = f", {kept_s[0]:.3f} to {kept_s[1]:.3f} s of the clip, {frames}"
     print(f"{options.output}: {size:,} bytes{part}")
 
 

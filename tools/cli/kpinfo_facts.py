@@ -115,7 +115,7 @@ def _shown(file: str) -> str:
 
 
 def _clip(clip: Clip) -> dict[str, Any]:
-    return {"frame_count": clip.frame_count, "fps": clip.fps, "duration_s": clip.frame_count / clip.fps}
+    return {"frame_count": clip.frame_count, "fps": clip.fps, "duration_s": clip.total_s}
 
 
 def _group(groups: Groups, number: int) -> dict[str, Any]:
@@ -123,7 +123,7 @@ def _group(groups: Groups, number: int) -> dict[str, Any]:
     span, clip = groups.timeline.spans[number], groups.clip
     since, until = (time * clip.duration_s for time in groups.timeline.display_span(number))
     if number == len(groups) - 1:
-        until = clip.frame_count / clip.fps  # The last frame is shown as long as the others.
+        until = clip.total_s  # The last frame is shown as long as the others.
     head = groups.open(number).head if groups.available(number) else None
     is_complete = head is not None and (not groups.is_single or groups.reader.source.size >= groups.size_bytes[0])
     return {

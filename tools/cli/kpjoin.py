@@ -51,7 +51,7 @@ def _command(argv: list[str]) -> None:
         parts = groups.group_inputs(scenes)
         size = groups.write(parts, options.output)
     clip = groups.Timeline(tuple(part.span for part in parts), parts[0].fps).clip
-    duration = f"{clip.frame_count} frames at {clip.fps:g} fps, {clip.duration_s:.2f} s"
+    duration = f"{clip.frame_count} frames at {clip.fps:g} fps, {clip.total_s:.2f} s"
     print(f"{options.output}: {size:,} bytes, {len(parts)} groups, {duration}")
 
 
