@@ -191,6 +191,7 @@ def test_only_the_box_of_a_contracted_scene_is_exported(run: Run, tmp_path: Path
         (["scene.kpc", "-o", "points.ply", "--format", "glb"], "contradicts"),
         (["scene.kpc", "-o", "points.ply", "--resolution", "64"], "--mesh"),
         (["scene.kpc", "-o", "points.ply", "--keyframes"], "cameras"),
+        (["scene.kpc", "-o", "cameras.usda", "--mesh"], "own cameras"),
         (["path.json", "-o", "path.fbx"], ".gltf, .usda, .usd, .usdc"),
         (["path.gltf", "-o", "path.usda"], ".json"),
         (["path.json", "-o", "path.usda", "--mesh"], "scenes"),

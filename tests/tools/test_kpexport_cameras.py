@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from test_kpexport import save
 
+import kpc
 from kpc.format.scene.cameras import View, load_views, save_views
 from kpc.format.scene.metadata import Metadata
 from kpc.player.app.camera_paths import CameraPath
@@ -75,6 +76,17 @@ def test_the_scene_places_cameras_both_ways(tmp_path: Path, name: str) -> None:
     placed = exchange(tmp_path, name, "--scene", file)[0].camera.camera_to_world
     x, y, z = EYES[0]
     assert np.abs(placed[:3, 3] - 0.25 * np.array([x, z, -y])).max() < TOLERANCE
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_cameras_of_a_scene_come_back_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    metadata = Metadata({"up": [0, 0, 1], "camera_names": ["left", "right"]})
+    scene = replace(tiny_scene(4), metadata=metadata)
+    file, out = str(save(scene, tmp_path / "scene.kpc")), str(tmp_path / "out.json")
+    assert kpexport.main([file, "-o", str(tmp_path / name)]) == 0
+    assert "y is up, in units of the scene" in capsys.readouterr().err
+    assert kpexport.main([str(tmp_path / name), "-o", out, "--scene", file, "--camera", "right"]) == 0
+    assert_same(load_views(out), [View(kpc.load(file).cameras[1], 0.0, "right.png")])
 
 
 def test_a_gltf_camera_is_valid_and_can_be_edited(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
     kpexport scene.kpc -o points.ply --time 0.5          surfaces as coloured points
     kpexport scene.kpc -o frames/ --format glb --step 5  a file for every fifth frame
     kpexport scene.kpc -o mesh.glb --mesh --time 0       an isosurface of the density
+    kpexport scene.kpc -o cameras.usda                   the scene's own cameras
     kpexport path.json -o path.usda --scene scene.kpc    a camera path of the player, or a camera file
     kpexport path.gltf -o path.json --scene scene.kpc    and back
 
@@ -25,13 +26,14 @@ from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
 from kpc.format.common.progress import progress
 from kpc.format.container.groups import GroupedScene, Groups
-from kpc.format.scene.cameras import save_views
+from kpc.format.scene.cameras import View, save_views
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Part
 from kpc.player.viewpoints import fit_camera
 from kpc.tools.exchange import gltf_cameras
-from kpc.tools.exchange.camera_tracks import load_tracks, placed, views_of
+from kpc.tools.exchange.camera_tracks import Track, load_tracks, placed, views_of
 from kpc.tools.exchange.geometry_files import write_geometry
 from kpc.tools.exchange.mesh import Mesh, surface_mesh
 from kpc.tools.exchange.options import DENSITY, PATH_FPS, RESOLUTION, SPACING_PARTS, USD_SUFFIXES, Task, parser, task_of
@@ -54,6 +56,8 @@ def _command(argv: list[str]) -> None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(parent))
     if task.kind == "geometry":
         _export_geometry(task, options)
+    elif task.kind == "cameras":
+        _export_cameras(task, options)
     else:
         _exchange_cameras(task, options)
 
@@ -68,8 +72,7 @@ def _export_geometry(task: Task, options: argparse.Namespace) -> None:
     if not task.is_folder and len(shots) != 1:
         raise UsageError(f"-o {options.output}: {len(shots)} frames do not go into one file; give a folder or --time")
     placement = Placement.of(scene.metadata)
-    if not placement.is_identity:
-        _say("turned and scaled by the up and the unit of the scene: y is up, in metres")
+    _say_where(placement, scene.metadata)
     if is_clipped(scene):
         _say("the scene goes on beyond its box; only what lies in the box is exported")
     render = None if options.mesh else _renderer(loaded, options)
@@ -86,6 +89,13 @@ def _export_geometry(task: Task, options: argparse.Namespace) -> None:
     what = "vertices" if options.mesh else "points"
     files = f"{len(shots)} files, " if task.is_folder else ""
     print(f"{output}: {files}{count:,} {what}, in {clock.monotonic() - started:.1f} s")
+
+
+def _say_where(placement: Placement, metadata: Metadata) -> None:
+    """Say how the scene is placed, if it is not kept where it is."""
+    if not placement.is_identity:
+        unit = "in metres" if "metres_per_unit" in metadata.document else "in units of the scene, whose length it lacks"
+        _say(f"placed by the metadata of the scene: y is up, {unit}")
 
 
 def _shots(scene: Scene, loaded: Scene | GroupedScene, options: argparse.Namespace) -> Shots:
@@ -127,6 +137,19 @@ def _mesh(loaded: Scene | GroupedScene, time: float, options: argparse.Namespace
     return surface_mesh(scene, local_time, options.resolution or RESOLUTION, options.density or DENSITY)
 
 
+def _export_cameras(task: Task, options: argparse.Namespace) -> None:
+    """Write the scene's own cameras for other programs."""
+    opened = Groups(options.input)
+    cameras, metadata = opened.cameras(), opened.metadata()
+    if not cameras:
+        raise KpcError(f"{options.input}: holds no cameras; give a camera file or a path of the player")
+    placement = Placement.of(metadata)
+    _say_where(placement, metadata)
+    names = metadata.names_of(len(cameras))
+    tracks = [Track(name, (View(camera, 0.0, name),)) for name, camera in zip(names, cameras, strict=True)]
+    _write_cameras(task, Path(options.output), placed(tracks, placement), PATH_FPS)
+
+
 def _exchange_cameras(task: Task, options: argparse.Namespace) -> None:
     """Write cameras of the player for other programs, or the reverse."""
     placement = Placement.of(None if options.scene is None else Groups(options.scene).metadata())
@@ -136,22 +159,27 @@ def _exchange_cameras(task: Task, options: argparse.Namespace) -> None:
     if task.kind == "to":
         fps = float(options.fps or PATH_FPS)
         tracks = placed(load_tracks(source, None if options.keyframes else fps), placement)
-        if task.suffix in USD_SUFFIXES:
-            _usd().write_usd_cameras(output, tracks, fps)
-            notes = []
-        else:
-            notes = gltf_cameras.write_gltf_cameras(output, tracks)
-        count = sum(len(track.views) for track in tracks)
-        what = f"a path of {count} instants" if tracks[0].is_moving else f"{count} camera{'s' * (count != 1)}"
-    else:
-        is_usd = source.suffix.lower() in USD_SUFFIXES
-        read = _usd().read_usd_cameras if is_usd else gltf_cameras.read_gltf_cameras
-        found, notes = read(source, options.size)
-        views = views_of(options.input, placed(found, placement.inverse), options.camera)
-        save_views(output, views)
-        what = f"{len(views)} view{'s' * (len(views) != 1)}"
+        _write_cameras(task, output, tracks, fps)
+        return
+    is_usd = source.suffix.lower() in USD_SUFFIXES
+    read = _usd().read_usd_cameras if is_usd else gltf_cameras.read_gltf_cameras
+    found, notes = read(source, options.size)
+    views = views_of(options.input, placed(found, placement.inverse), options.camera)
+    save_views(output, views)
     for note in notes:
         _say(note)
+    print(f"{output}: {len(views)} view{'s' * (len(views) != 1)}")
+
+
+def _write_cameras(task: Task, output: Path, tracks: list[Track], fps: float) -> None:
+    """Write placed cameras as glTF or USD, and say what the file loses."""
+    if task.suffix in USD_SUFFIXES:
+        _usd().write_usd_cameras(output, tracks, fps)
+    else:
+        for note in gltf_cameras.write_gltf_cameras(output, tracks):
+            _say(note)
+    count = sum(len(track.views) for track in tracks)
+    what = f"a path of {count} instants" if tracks[0].is_moving else f"{count} camera{'s' * (count != 1)}"
     print(f"{output}: {what}")
 
 

@@ -31,7 +31,7 @@ class Task:
     """What to do.
 
     Attributes:
-        kind: "geometry" of a scene; "to" or "from" the camera files of other programs.
+        kind: "geometry" or "cameras" of a scene; "to" or "from" the camera files of other programs.
         is_folder: whether geometry goes into a folder, one file a frame.
         suffix: of each file written, in small letters.
     """
@@ -46,8 +46,8 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="kpexport",
         description="Exchange points, meshes and cameras with Blender, Houdini, Unreal, Nuke and other programs: a "
-        ".kpc scene becomes coloured points or a mesh (.ply, .glb); a camera file or path of the player "
-        "(.json) becomes cameras (.gltf, .usda, .usd, .usdc), and those of a .gltf, .glb or USD file become a .json.",
+        ".kpc scene becomes coloured points or a mesh (.ply, .glb); its cameras, a camera file or a path of the "
+        "player (.json) become cameras (.gltf, .usda, .usd, .usdc); those of a .gltf, .glb or USD file become a .json.",
     )
     cli.add_version_option(made)
     made.add_argument("input", help="a .kpc file or its http address, or a file of cameras")
@@ -123,6 +123,9 @@ def task_of(options: argparse.Namespace) -> Task:
         else:
             _refuse(options, ("keyframes", "fps"), "is for paths that are written")
         return Task("to" if source == ".json" else "from", False, suffix)
+    if suffix in CAMERA_SUFFIXES and not options.output.endswith("/"):
+        _refuse(options, (*_OF_SCENES, *_OF_CAMERAS, "fps", "size", "appearance"), "is not for a scene's own cameras")
+        return Task("cameras", False, suffix)
     _refuse(options, _OF_CAMERAS, "is for cameras")
     _refuse(options, ("spacing", "normals", "size", "appearance") if options.mesh else ("resolution", "density"),
             "is for points" if options.mesh else "is for --mesh")  # fmt: skip
@@ -134,8 +137,8 @@ def task_of(options: argparse.Namespace) -> Task:
         return Task("geometry", True, f".{options.format or 'ply'}")
     if suffix not in GEOMETRY_SUFFIXES:
         raise UsageError(
-            f"-o {options.output}: {suffix} is not written from a scene; give {' or '.join(GEOMETRY_SUFFIXES)}, or a "
-            "folder: a name without suffix or with / at its end"
+            f"-o {options.output}: {suffix} is not written from a scene; give {' or '.join(GEOMETRY_SUFFIXES)}, "
+            f"{' or '.join(CAMERA_SUFFIXES)} for its cameras, or a folder: a name without suffix or with / at its end"
         )
     if options.format is not None and suffix != f".{options.format}":
         raise UsageError(f"-o {options.output}: --format {options.format} contradicts {suffix}; leave --format out")
