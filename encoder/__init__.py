@@ -19,7 +19,4 @@ def main(argv: list[str] | None = None) -> int:
         remedy = 'in a checkout of KPC, pip install ".[encoder]"'
         print(f"kpenc: needs {error.name}, which is not installed; {remedy}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:  # loading PyTorch takes seconds
-        print("kpenc: interrupted", file=sys.stderr)
-        return 130
     return kpenc.main(argv)

@@ -54,10 +54,10 @@ def test_every_option_of_every_command_exists(capsys: pytest.CaptureFixture[str]
     commands = [line for line in lines if line[0] in scripts or line[:2] == ["python", "-m"]]
     assert {line[0] for line in commands} == {*scripts, "python"}
     for name, *arguments in commands:
-        module = arguments[1] if name == "python" else scripts[name].split(":")[0]
+        module, _, function = (f"{arguments[1]}:main" if name == "python" else scripts[name]).partition(":")
         about = arguments[:1] if name == "kpbench" else []
         with pytest.raises(SystemExit):
-            importlib.import_module(module).main([*about, "--help"])
+            getattr(importlib.import_module(module), function)([*about, "--help"])
         known = set(re.findall(r"--?[a-z][a-z-]*", capsys.readouterr().out))
         used = {argument.split("=")[0] for argument in arguments[2 * (name == "python") :] if argument.startswith("-")}
         assert used <= known, f"{name} {shlex.join(arguments)}"

@@ -28,6 +28,7 @@ from kpc.encoder.rdo.codec_model import CodedModel, Model, code
 from kpc.encoder.rdo.model_checkpoint import save_checkpoint
 from kpc.encoder.rdo.sequential_finetune import steps_per_group
 from kpc.encoder.training.train import Report, Trainer
+from kpc.format.common import interrupts
 from kpc.format.common.compiling import working_s
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.common.progress import Progress
@@ -40,7 +41,7 @@ MAX_SLOTS = 8  # time slots of the occupancy, before they are merged
 
 
 class Abandoned(KeyboardInterrupt):
-    """The user pressed Ctrl-C again within a training step, whose incomplete changes are not to be saved."""
+    """Ctrl-C came in the first training step, or again in a later one, whose changes are not to be saved."""
 
 
 def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
@@ -186,19 +187,23 @@ def _select_cameras(dataset: Dataset) -> list[int]:
 
 
 def _train(trainer: Trainer, checkpoint: Path, options: Options) -> None:
-    """Train to the end, or until Ctrl-C, which waits for the current step.
+    """Train to the end, or until Ctrl-C, which waits for the current step, but not for the first and its kernels.
 
     Raises:
-        Abandoned: a second Ctrl-C came before the step's end.
+        Abandoned: Ctrl-C came in the first step, or a second one before the step's end.
         KeyboardInterrupt: the step has ended after a Ctrl-C.
     """
     requests: list[int] = []
+    begun = trainer.step
     preview = None if options.preview is None else Preview(trainer.dataset, options.preview)
 
     def note(number: int, _: Any) -> None:
         if requests:
             raise Abandoned
-        requests.append(number)
+        if trainer.step == begun:
+            interrupts.handle()
+        else:
+            requests.append(number)
 
     def report(state: Report) -> None:
         show_progress(progress, state)
@@ -206,12 +211,12 @@ def _train(trainer: Trainer, checkpoint: Path, options: Options) -> None:
             preview.update(trainer, state.step)
 
     with Progress("training", total=100, unit="%") as progress, handle_signals(note):
-        trainer.run(
-            report,
-            checkpoint,
-            time_budget_s=options.time_budget_s,
-            interrupted=lambda: bool(requests),
-        )
+        try:
+            trainer.run(report, checkpoint, time_budget_s=options.time_budget_s, interrupted=lambda: bool(requests))
+        except KeyboardInterrupt as error:
+            if requests:
+                raise
+            raise Abandoned from error
 
 
 def _wants_partial(trainer: Trainer, checkpoint: Path, may_ask: bool) -> bool:

@@ -1,7 +1,6 @@
 """`kpenc`: encode a folder of posed videos or images as a .kpc file, or code a trained model anew."""
 
 import contextlib
-import signal
 import sys
 import time
 from dataclasses import replace
@@ -20,7 +19,7 @@ from kpc.encoder.datasets import load_dataset
 from kpc.encoder.evaluation.ablations import effective_ablations
 from kpc.encoder.evaluation.profile import profile
 from kpc.encoder.evaluation.validation_rays import VALIDATION_RAYS
-from kpc.format.common import cli
+from kpc.format.common import cli, interrupts
 from kpc.format.common.compiling import MONITOR
 
 __all__ = ["ALL_VIEWS", "Options", "ablations", "dry_run", "encode", "main", "profile_steps"]
@@ -28,7 +27,7 @@ __all__ = ["ALL_VIEWS", "Options", "ablations", "dry_run", "encode", "main", "pr
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    with handle_signals(signal.default_int_handler):
+    with handle_signals(interrupts.handle):
         return cli.run(_command, "kpenc", argv)
 
 

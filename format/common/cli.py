@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from kpc.format.common import interrupts
 from kpc.format.common.errors import KpcError, UsageError
 from kpc.format.common.text import valid_unicode
 from kpc.format.common.version import VERSION
@@ -35,7 +36,8 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # names may hold what the terminal's encoding lacks
     try:
-        command(sys.argv[1:] if argv is None else argv)
+        with interrupts.heeded(name):
+            command(sys.argv[1:] if argv is None else argv)
     except UsageError as error:
         return _fail(name, str(error), 2)
     except KpcError as error:
@@ -44,7 +46,7 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         # A Ctrl-C that arrives inside a compiled function surfaces as a SystemError.
         if not any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):
             raise
-        return _fail(name, "interrupted", 130)
+        return _fail(name, "interrupted", interrupts.INTERRUPTED)
     except BrokenPipeError:
         sys.stderr.close()  # The reader of the output is gone; Python must not complain on exit.
         return 1

@@ -9,10 +9,15 @@ import threading
 import time
 from typing import Any
 
+from kpc.format.common import interrupts
+
 NOTICE = "compiling kernels for this processor, which takes a minute or two, once"
 
 # Seconds of compilation before the notice is due: now and then a single small kernel is missing from the cache.
 NOTICE_AFTER_S = 1.0
+
+# numba's event of its compiler, within which it compiles kernels or loads them from its cache.
+LOCK = "numba:compiler_lock"
 
 
 class CompilationMonitor:
@@ -55,6 +60,34 @@ class CompilationMonitor:
         return self._depth > 0 and self.spent_s >= NOTICE_AFTER_S
 
 
+class SafePlaces:
+    """Makes Ctrl-C wait, while numba compiles or loads a kernel, until the next pass of the compiler begins or ends."""
+
+    def __init__(self) -> None:
+        self._depth = 0
+
+    def on_start(self, which: Any) -> None:
+        """Record that numba takes the lock of its compiler."""
+        if threading.current_thread() is threading.main_thread():
+            self._depth += which.kind == LOCK
+            self._raise(which.kind != LOCK)
+
+    def on_end(self, which: Any) -> None:
+        """Record that numba is done, or at a place where an exception does no harm."""
+        if threading.current_thread() is threading.main_thread():
+            self._depth -= which.kind == LOCK
+            self._raise(which.kind != LOCK or not self._depth)
+
+    def is_busy(self) -> bool:
+        """Return whether the main thread is within the compiler."""
+        return self._depth > 0
+
+    @staticmethod
+    def _raise(is_safe: bool) -> None:
+        if is_safe:
+            interrupts.raise_pending()
+
+
 # Monitors this process, from the import of `kpc.format.common.jit` on.
 MONITOR = CompilationMonitor()
 
@@ -65,14 +98,20 @@ def working_s() -> float:
 
 
 def register() -> None:
-    """Have numba report its compilations to MONITOR."""
+    """Have numba report its compilations to MONITOR, and let Ctrl-C end them where that is safe."""
     from numba.core import event  # here, so that what shows progress need not load numba
 
     class Listener(event.Listener):  # type: ignore[misc]
+        def __init__(self, target: CompilationMonitor | SafePlaces) -> None:
+            self.target = target
+
         def on_start(self, event: event.Event) -> None:
-            MONITOR.on_start(event)
+            self.target.on_start(event)
 
         def on_end(self, event: event.Event) -> None:
-            MONITOR.on_end(event)
+            self.target.on_end(event)
 
-    event.register("numba:compile", Listener())
+    places = SafePlaces()
+    for kind, target in (("numba:compile", MONITOR), (LOCK, places), ("numba:run_pass", places)):
+        event.register(kind, Listener(target))
+    interrupts.defer_while(places.is_busy)

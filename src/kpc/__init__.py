@@ -7,22 +7,36 @@ picture = kpc.render(scene, scene.cameras[0], time=0.5).rgb     # (H, W, 3) floa
 """
 
 import os
-from typing import TYPE_CHECKING, BinaryIO
-
-from kpc.format.common.errors import KpcError
-from kpc.format.common.version import VERSION
-from kpc.format.scene.cameras import Camera
-from kpc.format.scene.scene import Scene
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from kpc.format.common.errors import KpcError
+    from kpc.format.common.version import VERSION as __version__
     from kpc.format.container.groups import GroupedScene
+    from kpc.format.scene.cameras import Camera
+    from kpc.format.scene.scene import Scene
     from kpc.player.cpu.reference import Rendering
 
 __all__ = ["Camera", "KpcError", "Scene", "__version__", "load", "render"]
 
-__version__ = VERSION
+# Where names are that are loaded when they are used, so that commands start before numpy is loaded.
+_HOMES = {
+    "Camera": "kpc.format.scene.cameras.Camera",
+    "KpcError": "kpc.format.common.errors.KpcError",
+    "Scene": "kpc.format.scene.scene.Scene",
+    "__version__": "kpc.format.common.version.VERSION",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a name of `_HOMES`."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, attribute = _HOMES[name].rpartition(".")
+    return getattr(import_module(module), attribute)
 
 
 def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int = 2 << 30) -> "Scene | GroupedScene":
@@ -47,7 +61,7 @@ def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int =
 
 
 def render(
-    scene: "Scene | GroupedScene", camera: Camera, time: float, appearance: "np.ndarray | None" = None
+    scene: "Scene | GroupedScene", camera: "Camera", time: float, appearance: "np.ndarray | None" = None
 ) -> "Rendering":
     """Render one picture with the reference renderer in numpy; no graphics card is needed.
 

@@ -1,0 +1,80 @@
+"""Ctrl-C in processes of their own: while modules load, while a command runs, and while kernels compile."""
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+# What is loaded as the module of a command, and interrupts itself.
+SIGNAL = "import os, signal\n\ndef press():\n    os.kill(os.getpid(), signal.SIGINT)\n"
+
+
+def interrupted(folder: Path, command: str) -> subprocess.CompletedProcess[str]:
+    """Run the module `command` by the way of entry points, with Ctrl-C heeded."""
+    (folder / "keyboard.py").write_text(SIGNAL)
+    (folder / "command.py").write_text(textwrap.dedent(command))
+    program = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from kpc.commands import _run; sys.path.insert(0, sys.argv.pop()); sys.exit(_run('kpx', 'command'))"
+    )
+    return subprocess.run([sys.executable, "-c", program, str(folder)], capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param("import keyboard\nkeyboard.press()\nmain = print", id="loading"),
+        pytest.param(
+            """
+            import keyboard
+            from kpc.format.common import cli
+            def main(argv):
+                return cli.run(lambda _: keyboard.press(), "kpx")
+            """,
+            id="running",
+        ),
+        pytest.param(
+            """
+            import time
+            import keyboard
+            from kpc.format.common import cli
+            def endless(_):
+                while True:  # loses what is raised, as callbacks of C do
+                    try:
+                        keyboard.press()
+                        time.sleep(60)
+                    except KeyboardInterrupt:
+                        pass
+            def main(argv):
+                return cli.run(endless, "kpx")
+            """,
+            id="a second one",
+        ),
+        pytest.param(
+            """
+            import keyboard
+            from numba import extending, njit, types
+            from kpc.format.common import cli, jit
+            def marker():
+                pass
+            @extending.overload(marker)
+            def _():
+                keyboard.press()  # deferred
+                return lambda: None
+            def main(argv):
+                return cli.run(lambda _: njit(lambda: marker())(), "kpx")
+            """,
+            id="compiling",
+        ),
+    ],
+)
+def test_ctrl_c_ends_in_one_line(tmp_path: Path, command: str) -> None:
+    done = interrupted(tmp_path, command)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "kpx: interrupted\n")
+
+
+def test_a_command_that_is_not_interrupted_returns_its_code(tmp_path: Path) -> None:
+    done = interrupted(tmp_path, "def main(argv):\n    return 3")
+    assert (done.returncode, done.stdout, done.stderr) == (3, "", "")
