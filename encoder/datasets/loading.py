@@ -193,6 +193,14 @@ def _report_notes(root: Path, videos: dict[str, VideoInfo]) -> None:
     for note in dict.fromkeys(note for video in videos.values() for note in video.notes):
         names = [name for name, video in videos.items() if note in video.notes]
         print(f"{root}: {first_names(names)}: {note}", file=sys.stderr)
+    timecodes = {video.timecode: name for name, video in videos.items() if video.timecode}
+    if len(timecodes) > 1:
+        shown = [f"{name} at {timecode}" for timecode, name in sorted(timecodes.items())]
+        print(
+            f"{root}: videos begin at different timecodes ({first_names(shown)}), but are aligned by their times of "
+            "presentation; if the timecodes are right, cut the videos to begin at the same one",
+            file=sys.stderr,
+        )
 
 
 def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

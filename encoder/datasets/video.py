@@ -37,7 +37,14 @@ from kpc.format.common.media_files import require_file
 _MATRICES = {1: "bt709", 4: "fcc", 5: "bt601", 6: "bt601", 7: "smpte240m", 9: "bt2020"}
 _OTHER_MATRICES = {8: "YCgCo", 10: "BT.2020 constant luminance", 14: "ICtCp", 15: "IPT"}
 
-_HDR_CURVES = {16: "PQ", 18: "HLG"}  # transfer characteristics of H.273
+# Transfer characteristics of H.273 that are far from BT.709, and colour primaries that are about those of sRGB.
+_HDR_CURVES = {16: "PQ", 18: "HLG"}
+_OTHER_CURVES = {8: "linear light", 9: "logarithmic", 10: "logarithmic", 17: "SMPTE ST 428-1"}
+_COMMON_PRIMARIES = (0, 1, 2, 3, 5, 6, 7)
+
+# libav's numbers of projections, but for the flat ones, and of packings of two views in one picture or in turn.
+_PROJECTIONS = {0: "equirectangular", 1: "a cube map", 2: "equirectangular", 3: "half equirectangular", 5: "fisheye"}
+_PACKINGS = range(1, 8)
 
 # libav's numbers of field orders: which field is shown first.
 _TOP_FIRST, _BOTTOM_FIRST = (2, 5), (3, 4)
@@ -62,6 +69,7 @@ class VideoInfo:
         interlaced: whether frames consist of two fields, which `read_video` deinterlaces.
         has_time_stamps: whether frames have presentation times; else `times` follows from the order of decoding.
         notes: what a user should know about how the video is read, each as an end of a sentence about it.
+        timecode: of the first frame, which is not used; None without one.
     """
 
     width: int
@@ -77,6 +85,7 @@ class VideoInfo:
     interlaced: bool
     has_time_stamps: bool
     notes: tuple[str, ...]
+    timecode: str | None = None
 
     @property
     def frame_count(self) -> int:
@@ -100,6 +109,7 @@ def video_info(path: str | os.PathLike[str]) -> VideoInfo:
         if stamps.missing:
             whole = sum(frame is not None for frame in _decoded_anew(path))
             raise _damaged(path, whole, max(whole, len(stamps.times)) + stamps.missing)
+        _require_pinhole(path, first)
         turned = _transposes(_display_matrix(path, first))
         height, width = (first.width, first.height) if turned else (first.height, first.width)
         aspect = float(stream.sample_aspect_ratio or 1)
@@ -117,7 +127,13 @@ def video_info(path: str | os.PathLike[str]) -> VideoInfo:
             pixel_aspect=1 / aspect if turned else aspect,
             interlaced=interlaced,
             has_time_stamps=stamps.are_given,
-            notes=(*_stream_notes(container), *stamps.notes, *(["interlaced; deinterlaced (bwdif)"] * interlaced)),
+            notes=(
+                *_stream_notes(container),
+                *stamps.notes,
+                *(["interlaced; deinterlaced (bwdif)"] * interlaced),
+                *_colour_notes(first),
+            ),
+            timecode=stream.metadata.get("timecode") or container.metadata.get("timecode"),
         )
 
 
@@ -179,6 +195,11 @@ def _films(container: InputContainer) -> list[VideoStream]:
 def _stream_notes(container: InputContainer) -> list[str]:
     count = len(_films(container))
     return [f"{count} video streams; the first is used"] if count > 1 else []
+
+
+def _colour_notes(frame: VideoFrame) -> list[str]:
+    number = int(frame.color_primaries)
+    return [] if number in _COMMON_PRIMARIES else [f"colour primaries number {number} of H.273 are not converted"]
 
 
 def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame | None]:
@@ -327,6 +348,25 @@ def _deinterlacing(frame: VideoFrame, stream: VideoStream) -> dict[str, str]:
     return {"deint": "all", "parity": "tff" if order in _TOP_FIRST else "bff"}
 
 
+def _require_pinhole(path: str | os.PathLike[str], frame: VideoFrame) -> None:
+    """Refuse pictures that are no perspective projection, or two in one.
+
+    Raises:
+        MediaError: the video says that it is spherical, fisheye or stereoscopic.
+    """
+    spherical, stereo = (frame.side_data.get(kind) for kind in ("SPHERICAL", "STEREO3D"))
+    projection = _PROJECTIONS.get(_first_int(spherical)) if spherical is not None else None
+    if projection is not None:
+        raise MediaError(f"{path}: its projection is {projection}; undistort it to a pinhole")
+    if stereo is not None and _first_int(stereo) in _PACKINGS:
+        raise MediaError(f"{path}: is stereoscopic, two views in one video; split them into two videos")
+
+
+def _first_int(side_data: object) -> int:
+    """Return the number with which libav's structures of side data begin."""
+    return int(np.frombuffer(bytes(side_data), np.int32, 1)[0])  # type: ignore[call-overload]
+
+
 def _display_matrix(path: str | os.PathLike[str], frame: VideoFrame) -> np.ndarray:
     """Return the matrix [[a, b], [c, d]] that takes a stored pixel (x, y) to (a x + c y, b x + d y) on the screen.
 
@@ -362,6 +402,8 @@ def _matrix(path: str | os.PathLike[str], frame: VideoFrame, stream: VideoStream
     for curve in (int(frame.color_trc), int(stream.codec_context.color_trc)):
         if curve in _HDR_CURVES:
             raise MediaError(f"{path}: HDR video ({_HDR_CURVES[curve]}); tone-map it to BT.709 first")
+        if curve in _OTHER_CURVES:
+            raise MediaError(f"{path}: its transfer curve is {_OTHER_CURVES[curve]}; convert it to BT.709 first")
     if frame.format.is_rgb or frame.format.has_palette:
         return "rgb"
     for number in (int(frame.colorspace), int(stream.codec_context.colorspace)):

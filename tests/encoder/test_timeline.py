@@ -228,6 +228,15 @@ def test_rates_that_differ(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert not dataset.is_monocular and "monocular" not in dataset.describe()
 
 
+def test_timecodes_that_differ_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def coded(_: int, source: Path, path: Path) -> None:
+        copy(source, path, "-timecode", "01:00:00:05" if path.stem == "cam01" else "01:00:00:00")
+
+    dataset = changed(tmp_path, coded, frames=6, suffix=".mov")
+    assert len(dataset.pictures) == 18
+    assert "begin at different timecodes" in said(capsys)
+
+
 def test_pixels_that_are_not_square(tmp_path: Path) -> None:
     """Calibrated for what is shown, the stored pixels have another focal length across; else it is refused."""
     narrow = ("-vf", "scale=24:24,setsar=4/3", *CODING)

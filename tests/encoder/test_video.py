@@ -117,6 +117,52 @@ def test_hdr_is_refused(tmp_path: Path, curve: str, words: str) -> None:
     refused(tmp_path / "x.mkv", words, "tone-map")
 
 
+@pytest.mark.parametrize("curve, words", [(8, "linear light"), (9, "logarithmic")])
+def test_curves_far_from_that_of_television_are_refused(tmp_path: Path, curve: int, words: str) -> None:
+    film(tmp_path / "a.mp4")
+    copy(tmp_path / "a.mp4", tmp_path / "x.mp4", "-bsf:v", f"h264_metadata=transfer_characteristics={curve}")
+    refused(tmp_path / "x.mp4", f"its transfer curve is {words}", "BT.709")
+
+
+def test_wide_primaries_are_named(tmp_path: Path) -> None:
+    film(tmp_path / "x.mp4", "-vf", "format=yuv444p,setparams=color_primaries=smpte432")
+    assert video_info(tmp_path / "x.mp4").notes == ("colour primaries number 12 of H.273 are not converted",)
+
+
+def test_two_views_in_one_picture_are_refused(tmp_path: Path) -> None:
+    film(tmp_path / "x.mp4", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-x264-params", "frame-packing=3")
+    refused(tmp_path / "x.mp4", "is stereoscopic", "split them into two videos")
+
+
+@pytest.mark.parametrize(
+    "projection, words", [(b"equi", "equirectangular"), (b"cbmp", "a cube map"), (b"mshp", None), (None, None)]
+)
+def test_projections_of_spherical_videos(tmp_path: Path, projection: bytes | None, words: str | None) -> None:
+    """As in Google's Spherical Video V2: boxes within the description of an MP4's samples."""
+    film(tmp_path / "flat.mp4")
+
+    def box(kind: bytes, content: bytes) -> bytes:
+        return (len(content) + 8).to_bytes(4, "big") + kind + content
+
+    data = bytearray((tmp_path / "flat.mp4").read_bytes())
+    if projection is not None:
+        known = box(b"prhd", bytes(16)) + box(projection, bytes(20))
+        added = box(b"sv3d", box(b"svhd", bytes(5)) + box(b"proj", known))
+        entry = data.index(b"avc1", data.index(b"stsd")) - 4
+        end = entry + int.from_bytes(data[entry : entry + 4], "big")
+        data[end:end] = added
+        for start in (
+            entry,
+            *(data.index(name) - 4 for name in (b"stsd", b"stbl", b"minf", b"mdia", b"trak", b"moov")),
+        ):
+            data[start : start + 4] = (int.from_bytes(data[start : start + 4], "big") + len(added)).to_bytes(4, "big")
+    (tmp_path / "x.mp4").write_bytes(data)
+    if words is None:
+        assert video_info(tmp_path / "x.mp4").frame_count == 12
+    else:
+        refused(tmp_path / "x.mp4", f"its projection is {words}", "undistort")
+
+
 def test_a_matrix_that_cannot_be_converted_is_refused(tmp_path: Path) -> None:
     film(tmp_path / "x.mkv", "-c:v", "ffv1", "-pix_fmt", "yuv444p", "-vf", "format=yuv444p,setparams=colorspace=ycgco")
     refused(tmp_path / "x.mkv", "colour matrix YCgCo")
