@@ -19,6 +19,15 @@ VERIFIED = 8
 # A picture is of one colour if no channel varies by more than this many of its 255 levels.
 FLAT = 2
 
+# Pictures are nearly black if no value exceeds this: those of a camera of 12 bits have at most 15 of 255 where its
+# values are stored in 16 bits as they are.
+DARK = 16
+
+# Pictures of cameras far apart are alike if they differ by less than this share of what a shift by a pixel changes, and
+# than this share of what pictures usually differ by. Cameras are far apart by this share of their mean distance from
+# the middle.
+ALIKE, ALIKE_OF_MEDIAN, FAR_APART = 0.5, 0.25, 0.5
+
 
 def doubts(dataset: Dataset) -> Iterator[str]:
     """Yield a line for each sign that the result will mean less than it seems; none for good data.
@@ -27,18 +36,19 @@ def doubts(dataset: Dataset) -> Iterator[str]:
     checksums of the cache.
     """
     yield from _flat_pictures(dataset)
+    yield from _dark_pictures(dataset)
     yield from _equal_pictures(dataset)
+    yield from _alike_pictures(dataset)
     yield from _cameras(dataset)
 
 
 def _flat_pictures(dataset: Dataset) -> Iterator[str]:
     """Doubt pictures of one colour, or without anything opaque."""
-    count = len(dataset.pictures)
-    looked_at = np.unique(np.linspace(0, count - 1, min(count, PICTURES)).round().astype(int))
-    flat = [int(n) for n in looked_at if _is_flat(dataset, n, ROWS)]
+    looked_at = _spread(len(dataset.pictures))
+    flat = [n for n in looked_at if _is_flat(dataset, n, ROWS)]
     if not flat or not all(_is_flat(dataset, n) for n in flat[:VERIFIED]):
         return
-    is_empty = dataset.has_alpha and not dataset.pixels.picture(flat[0])[..., 3].any()
+    is_empty = dataset.has_alpha and dataset.pixels.picture(flat[0])[..., 3].max() <= FLAT
     meaning = "show nothing (they are transparent)" if is_empty else "are of one colour"
     names = first_names(list(dict.fromkeys(dataset.pictures.file[n] for n in flat)))
     share = "all" if len(flat) == len(looked_at) else f"{len(flat)} of {len(looked_at)}"
@@ -47,17 +57,41 @@ def _flat_pictures(dataset: Dataset) -> Iterator[str]:
 
 def _is_flat(dataset: Dataset, number: int, rows: int | None = None) -> bool:
     """Return whether a picture, or `rows` of its rows, is of one colour; what is fully transparent does not count."""
-    height = int(dataset.pictures.height[number])
-    if rows is None or rows >= height:
-        pixels = dataset.pixels.picture(number)
-    else:
-        tops = np.linspace(0, height - 1, rows).astype(int)
-        pixels = np.concatenate([dataset.pixels.picture(number, top, top + 1) for top in tops.tolist()])
+    pixels = _rows(dataset, number, rows)
     if dataset.has_alpha:
-        if not pixels[..., 3].any():
+        if pixels[..., 3].max() <= FLAT:
             return True
         pixels = np.where(pixels[..., 3:] > 0, pixels, pixels[pixels[..., 3] > 0][0])
     return bool(np.ptp(pixels.reshape(-1, pixels.shape[2]), axis=0).max() <= FLAT)
+
+
+def _rows(dataset: Dataset, number: int, rows: int | None) -> np.ndarray:
+    """Return a picture, or `rows` of its rows, evenly spread: (rows, W, C) uint8."""
+    height = int(dataset.pictures.height[number])
+    if rows is None or rows >= height:
+        return dataset.pixels.picture(number)
+    tops = np.linspace(0, height - 1, rows).astype(int)
+    return np.concatenate([dataset.pixels.picture(number, top, top + 1) for top in tops.tolist()])
+
+
+def _dark_pictures(dataset: Dataset) -> Iterator[str]:
+    """Doubt pictures that are all nearly black, but not of one colour."""
+    looked_at = _spread(len(dataset.pictures))
+    brightest = 0
+    for n in looked_at:
+        brightest = max(brightest, int(_rows(dataset, n, ROWS)[..., :3].max()))
+        if brightest > DARK:
+            return
+    if not all(_is_flat(dataset, n, ROWS) for n in looked_at):
+        yield (
+            f"all pictures looked at are nearly black: no value exceeds {brightest} of 255; scale 16-bit files of a "
+            "camera of 10 or 12 bits to the whole range"
+        )
+
+
+def _spread(count: int) -> list[int]:
+    """Return at most PICTURES of so many numbers, evenly spread."""
+    return sorted({int(n) for n in np.linspace(0, count - 1, min(count, PICTURES)).round()})
 
 
 def _equal_pictures(dataset: Dataset) -> Iterator[str]:
@@ -86,6 +120,37 @@ def _equal_pictures(dataset: Dataset) -> Iterator[str]:
         yield f"cameras in different places show the same picture: {first_names(cameras_named)}; check these files"
 
 
+def _alike_pictures(dataset: Dataset) -> Iterator[str]:
+    """Doubt cameras in different places that show about the same at the same time, such as one video encoded twice."""
+    p = dataset.pictures
+    of_camera: dict[int, int] = {}  # the picture of each camera that is nearest to the middle of the clip
+    for n in np.argsort(np.abs(p.time - 0.5), kind="stable").tolist():
+        of_camera.setdefault(int(p.camera[n]), n)
+    cameras = sorted(of_camera)
+    numbers = [of_camera[cameras[k]] for k in _spread(len(cameras))]
+    centres = p.camera_to_world[numbers, :3, 3]
+    far = FAR_APART * np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()
+    keys = [(int(p.width[n]), int(p.height[n]), float(p.time[n])) for n in numbers]
+    for key in set(keys):
+        chosen = [k for k, other in enumerate(keys) if other == key]
+        rows = np.stack([_rows(dataset, numbers[k], ROWS)[..., :3].astype(np.float32) for k in chosen])
+        flat, shifts = rows.reshape(len(rows), -1), ((rows[:, :, 1:] - rows[:, :, :-1]) ** 2).sum(axis=(1, 2, 3))
+        power = (flat**2).sum(axis=1)
+        first, second = np.triu_indices(len(rows), 1)
+        squares = np.maximum((power[:, None] + power - 2 * flat @ flat.T)[first, second], 0)
+        ratios = np.sqrt(squares / np.maximum(shifts[first], 1e-9))
+        if not len(ratios):
+            continue
+        distances = np.linalg.norm(centres[chosen][first] - centres[chosen][second], axis=1)
+        is_alike = (ratios < min(ALIKE, ALIKE_OF_MEDIAN * float(np.median(ratios)))) & (distances > far)
+        for i, j in zip(first[is_alike].tolist(), second[is_alike].tolist(), strict=True):
+            pair = [numbers[chosen[k]] for k in (i, j)]
+            if len({dataset.pixels.tiles[n].crc32c for n in pair}) == 2:
+                names = " and ".join(first_names([dataset.camera_names[int(p.camera[n])]]) for n in pair)
+                yield f"cameras far apart show nearly the same picture: {names}; check these files"
+                return
+
+
 def _cameras(dataset: Dataset) -> Iterator[str]:
     """Doubt cameras that coincide, look past their picture, or lack the depth range that others have."""
     p = dataset.pictures
@@ -101,7 +166,7 @@ def _cameras(dataset: Dataset) -> Iterator[str]:
         names = first_names(list(dict.fromkeys(p.file[n] for n in np.flatnonzero(outside))))
         yield f"the principal point lies outside of {int(outside.sum())} pictures: {names}; check cx and cy"
     known = np.isfinite(p.near) & np.isfinite(p.far)
-    if known.any() and not known.all():
+    if (np.isfinite(p.near) | np.isfinite(p.far)).any() and not known.all():
         yield (
             f"near and far are known for {int(known.sum())} of {len(p)} pictures only, so the box does not follow from "
             "them; give them for all or none"

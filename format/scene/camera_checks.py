@@ -142,12 +142,14 @@ def check_depths(where: str, near: float, far: float) -> None:
     """Check a depth range, whose ends are NaN where they are unknown.
 
     Raises:
-        DatasetError: not 0 < near < far < infinity.
+        DatasetError: not 0 < near < far <= NUMBER_LIMIT.
     """
     low, high = (0.0 if math.isnan(near) else near), (math.inf if math.isnan(far) else far)
-    ends_fit = (math.isnan(near) or near > 0) and (math.isnan(far) or far < math.inf)
+    ends_fit = (math.isnan(near) or near > 0) and (math.isnan(far) or far <= NUMBER_LIMIT)
     if not (ends_fit and low < high):
-        raise DatasetError(f"{where}: near {near:g} and far {far:g} are not 0 < near < far; calibrate anew")
+        raise DatasetError(
+            f"{where}: near {near:g} and far {far:g} are not 0 < near < far < {NUMBER_LIMIT:g}; calibrate anew"
+        )
 
 
 def check_pinhole(where: str, keys: Mapping[str, Any]) -> None:

@@ -55,6 +55,16 @@ def test_rows_belong_to_unpadded_names_in_the_order_that_fits(
         np.testing.assert_allclose(pose, rig[names.index(Path(file).name)].camera_to_world, atol=1e-12)
 
 
+def test_rows_that_were_sorted_without_regard_to_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = make.write_llff(tmp_path / "set", images=9)
+    names = [f"{'img' if k % 3 else 'IMG'}{k}.png" for k in range(9)]
+    renumber(tmp_path / "set/images", names)
+    p = load(tmp_path / "set").pictures
+    assert "without regard to case, by which" in said(capsys)
+    for file, pose in zip(p.file, p.camera_to_world, strict=True):
+        np.testing.assert_allclose(pose, rig[names.index(Path(file).name)].camera_to_world, atol=1e-12)
+
+
 def test_rows_of_unpadded_videos(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Too few of them to tell one order from the other are taken in LLFF's."""
     rig = make.write_n3dv(tmp_path / "set", cameras=3, frames=1)
@@ -208,6 +218,24 @@ def test_what_is_not_understood_is_refused(tmp_path: Path, keys: dict[str, Any],
     removed = ["fl_y"] if "y_fov" in keys else []
     fails(nerfstudio(tmp_path / "set", without(*removed, **keys)), "transforms.json", words)
     fails(nerfstudio(tmp_path / "set", lambda d: d["frames"][1].update(keys)), "frame 1", words)
+
+
+@pytest.mark.parametrize(
+    "keys, words",
+    [
+        ({"lens": "Fish-Eye"}, "lens: Fish-Eye"),
+        ({"distortion_model": "fisheye"}, "distortion_model: fisheye"),
+        ({"vr180": True}, "vr180 is not supported"),
+        ({"K1": 0.1}, "the key 'K1' is not read; write it k1"),
+        ({" fl_x": 9.0}, "the key ' fl_x' is not read; write it fl_x"),
+    ],
+)
+def test_unknown_keys_that_matter_are_refused(tmp_path: Path, keys: dict[str, Any], words: str) -> None:
+    make.write_nerfstudio(tmp_path / "set", **keys)
+    fails(tmp_path / "set", words)
+    make.write_nerfstudio(tmp_path / "frames")
+    make.edit_json(tmp_path / "frames/transforms.json", lambda d: d["frames"][3].update(keys))
+    fails(tmp_path / "frames", "frame 3", words)
 
 
 def test_more_that_is_refused(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import datasets as make
 from datasets import load
@@ -108,3 +109,29 @@ def test_principal_points_and_depths(tmp_path: Path) -> None:
     assert "principal point lies outside of 10 pictures" in outside and "1 of 10 pictures only" in some
     document = json.loads((tmp_path / "set" / "transforms.json").read_text())
     assert document["frames"][1]["near"] == 1.0
+
+
+def test_a_picture_that_was_encoded_twice(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set")
+    files = images_of(tmp_path / "set")
+    for number, file in enumerate(files):
+        noise = np.random.default_rng(9 if number == 1 else number).integers(0, 256, (8, 8, 3), np.uint8)
+        write_image(file, np.kron(noise, np.ones((3, 4, 1), np.uint8)))
+    Image.open(files[9]).save(files[1], "JPEG", quality=95, subsampling=0)
+    (line,) = lines_of(tmp_path / "set")
+    assert "0001 and 0009" in line and "nearly the same picture" in line
+
+
+def test_pictures_of_a_camera_that_fills_12_of_16_bits(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set")
+    for number, file in enumerate(images_of(tmp_path / "set")):
+        values = np.random.default_rng(number).integers(0, 1 << 12, (24, 32)).astype(np.uint16)
+        Image.fromarray(values).save(file)
+    (line,) = lines_of(tmp_path / "set")
+    assert "nearly black: no value exceeds 15 of 255" in line
+
+
+def test_one_end_of_the_depth_range(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set", near=1.0)
+    (line,) = lines_of(tmp_path / "set")
+    assert "near and far are known for 0 of 10 pictures" in line

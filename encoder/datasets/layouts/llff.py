@@ -53,9 +53,10 @@ def read(path: Path, holdout: str | None) -> Capture:
     videos = [file for file in found if is_video(file)]
     files = [file for file in videos if file.name.lower().startswith("cam")] or videos
     layout = "N3DV" if files else NAME
-    if not files and (path / "images").is_dir():
-        found = media_in(path / "images")
-        files = [file for file in found if is_image(file)]
+    if (path / "images").is_dir():
+        images = media_in(path / "images")
+        found = [*found, *images] if files else images
+        files = files or [file for file in images if is_image(file)]
     if not files:
         raise DatasetError(
             f"{path}: has {POSES}, but neither cam*.mp4 nor, in images/, any image that is read, such as PNG or JPEG; "

@@ -7,8 +7,9 @@ made by hand may be in natural order: cam1, cam2, cam10. Where the two differ, t
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -18,6 +19,13 @@ from kpc.encoder.datasets.video import read_video
 from kpc.format.common.images import read_image
 from kpc.format.common.media_files import is_video
 
+# Orders of names in which rows may have been written, by what they sort: the first is LLFF's own.
+ORDERS: dict[str, Callable[[str], Any]] = {
+    "plain order of names": os.fsencode,
+    "natural order of names": natural_key,
+    "order of names without regard to case": lambda name: natural_key(name.casefold()),
+}
+
 # At most so many files are compared, evenly spread, as pictures of this size.
 COMPARED_FILES = 64
 THUMBNAIL = (16, 12)
@@ -25,7 +33,7 @@ THUMBNAIL = (16, 12)
 # Each picture is compared with those of this many nearest cameras.
 NEIGHBOURS = 2
 
-# Natural order is taken if neighbours then differ by less than this share of what they differ by in plain order.
+# Another order is taken if neighbours then differ by less than this share of what they differ by in plain order.
 CLEARLY_LESS = 0.95
 
 
@@ -41,25 +49,29 @@ def in_row_order(table: Path, files: Sequence[Path], centres: np.ndarray, direct
     Raises:
         MediaError: a file cannot be read.
     """
-    plain = sorted(files, key=lambda file: os.fsencode(file.name))
-    natural = sorted(files, key=lambda file: natural_key(file.name))
-    if plain == natural:
+    orders: dict[str, list[Path]] = {}
+    for name, key in ORDERS.items():
+        order = sorted(files, key=lambda file: (key(file.name), os.fsencode(file.name)))
+        if order not in orders.values():
+            orders[name] = order
+    plain = next(iter(orders.values()))
+    if len(orders) == 1:
         return plain
     chosen = [plain[n] for n in np.linspace(0, len(plain) - 1, min(len(plain), COMPARED_FILES)).astype(int)]
     pictures = np.stack([_thumbnail(file) for file in chosen])
     cost = {}
-    for name, order in (("plain", plain), ("natural", natural)):
+    for name, order in orders.items():
         row_of = {file: n for n, file in enumerate(order)}
         rows = [row_of[file] for file in chosen]
         cost[name] = neighbour_difference(centres[rows], directions[rows], pictures)
-    is_natural = cost["natural"] < CLEARLY_LESS * cost["plain"]
-    order, other = (natural, plain) if is_natural else (plain, natural)
+    default = next(iter(orders))
+    ranked = sorted(orders, key=lambda name: cost[name])
+    why = ranked[0] if cost[ranked[0]] < CLEARLY_LESS * cost[default] else default
+    order, other = orders[why], orders[next(name for name in (default, *ranked) if name != why)]
     row = next(n for n, (file, another) in enumerate(zip(order, other, strict=True)) if file != another)
-    why = (
-        "natural order of names, by which neighbouring cameras see more alike" if is_natural else "plain order of names"
-    )
+    reason = "" if why == default else ", by which neighbouring cameras see more alike"
     print(
-        f"{table}: rows belong to files in the {why}: row {row} to {printable(order[row].name)}, not to "
+        f"{table}: rows belong to files in the {why}{reason}: row {row} to {printable(order[row].name)}, not to "
         f"{printable(other[row].name)}; if not, rename the files so that their order is that of the rows",
         file=sys.stderr,
     )
