@@ -192,6 +192,12 @@ def keys_of_quality_and_panels(player: Player) -> None:
     assert player.snapshot().panels == {"planes"}
     press(player, "g")  # a panel that is asked for appears, and those beside it
     assert player.snapshot().panels == {"controls", "planes", "graphs"}
+    with replaced(imgui, button=lambda label, *_: label == "open"):
+        player.frame()
+    player.frame()
+    assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
+    press(player, glfw.KEY_ESCAPE)
+    assert not imgui.is_popup_open("", imgui.PopupFlags_.any_popup) and not player.state.should_close
     player.state.quality.choose(level)  # the level that U chose depends on the machine
     text_size = player.state.text_size
     player.press(glfw.KEY_EQUAL, glfw.MOD_CONTROL)

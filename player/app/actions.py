@@ -15,6 +15,7 @@ from kpc.player.app.preferences import TEXT_SIZES
 from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.scene_view import SceneView
 from kpc.player.app.state import PlayerState, Shown
+from kpc.player.app.widgets import close_lists
 from kpc.player.cpu.reference import Part
 from kpc.player.gl.presentation import DisplayMode
 from kpc.player.quality import neighbouring_level
@@ -269,7 +270,9 @@ class Actions:
                 raise
 
     def quit(self) -> None:
-        """End the player; if it asks about an unsaved camera path, stay."""
+        """Close an open list, or else end the player; if it asks about an unsaved camera path, stay."""
+        if close_lists():
+            return
         if self.state.should_close:
             self.stay()
         else:

@@ -131,7 +131,7 @@ KEY_BINDINGS = (
     ),
     KeyBinding("Tab", "show or hide the controls", {"Tab": lambda do: do.toggle_panel("controls")}),
     KeyBinding("H", "show this list", {"h": lambda do: do.toggle_panel("keys")}),
-    KeyBinding("Esc", "quit", {"Esc": Actions.quit}),
+    KeyBinding("Esc", "close an open list, or quit", {"Esc": Actions.quit}),
 )
 _ACTIONS = {shortcut: action for binding in KEY_BINDINGS for shortcut, action in binding.actions.items()}
 

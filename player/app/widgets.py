@@ -107,6 +107,14 @@ def choice(name: str, present: Value, names: dict[Value, str]) -> Value:
     return values[chosen] if changed else present
 
 
+def close_lists() -> bool:
+    """Close all lists and menus that are open; return whether there were any."""
+    are_open = imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
+    if are_open:
+        imgui.internal.close_popup_to_level(0, True)
+    return are_open
+
+
 def toggle(name: str, is_on: bool) -> bool:
     """Build a button that stays down; return whether it is down."""
     if is_on:
