@@ -50,6 +50,14 @@ def test_bugs_keep_their_traceback(error: Exception, cause: Exception | None) ->
         cli.run(raising(error, cause), "kpx", [])
 
 
+@pytest.mark.parametrize("module", ["encoder.cli.kpenc", "tools.cli.kpedit", "tools.cli.kpjoin"])
+def test_commands_that_read_files_alone_refuse_addresses(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module(f"kpc.{module}").main(["https://user:secret@host/a.kpc", "-o", "b.kpc"])
+    err = capsys.readouterr().err
+    assert ended.value.code == 2 and err.endswith("download the file and give its path\n") and "secret" not in err
+
+
 @pytest.mark.parametrize(
     "module",
     [

@@ -122,7 +122,7 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     cli.add_version_option(parser)
     parser.add_argument(
         "source",
-        type=Path,
+        type=cli.input_path,
         help="folder with videos or images, and poses_bounds.npy, transforms*.json or sparse/0; "
         "or a finished checkpoint, or a .kpc file",
     )

@@ -8,6 +8,7 @@ import io
 import json
 import math
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -111,6 +112,13 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def input_path(text: str) -> Path:
+    """Parse the path of a file or folder to read; refuse addresses, which as paths would lose a slash."""
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", text):
+        raise argparse.ArgumentTypeError("an address cannot be given here; download the file and give its path")
+    return Path(text)
 
 
 def output_file(*suffixes: str) -> Callable[[str], Path]:

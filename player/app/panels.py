@@ -241,7 +241,8 @@ class Panels:
                 imgui.text_colored(ACCENT, f"finishing {name}")
                 return top
             if filming.is_along_path:
-                text = f"frame {recording.taken} of {filming.path_frames}{_time_left(filming.left_s)}"
+                total = filming.path_frames  # of one width all along, so that the button stays where it is
+                text = f"frame {recording.taken:{len(str(total))}} of {total}{_time_left(filming.left_s):13}"
             else:
                 text = f"{recording.duration_s:.1f} s"
             imgui.align_text_to_frame_padding()

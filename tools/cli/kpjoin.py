@@ -31,7 +31,7 @@ def _command(argv: list[str]) -> None:
         "follow one another in the given order.",
     )
     cli.add_version_option(parser)
-    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE", help=".kpc files")
+    parser.add_argument("scenes", nargs="+", type=cli.input_path, metavar="SCENE", help=".kpc files")
     parser.add_argument(
         "-o", "--output", type=cli.output_file(".kpc"), required=True, metavar="FILE", help="the .kpc file to write"
     )
