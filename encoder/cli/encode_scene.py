@@ -217,6 +217,8 @@ def _train(trainer: Trainer, checkpoint: Path, options: Options) -> None:
             if requests:
                 raise
             raise Abandoned from error
+    if preview is not None:
+        preview.write(trainer, trainer.step)
 
 
 def _wants_partial(trainer: Trainer, checkpoint: Path, may_ask: bool) -> bool:

@@ -23,6 +23,7 @@ import datasets as make
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.datasets import pixel_cache
+from kpc.encoder.evaluation.preview import Preview
 from kpc.encoder.field.config import PRESETS
 from kpc.encoder.training.train import Trainer
 from kpc.format.common import cli
@@ -141,8 +142,11 @@ def test_the_hybrid_decoder(run: Kpenc, sets: Path, tmp_path: Path, name: str) -
     assert 5 < json.loads(out)["test_psnr"] < 60
 
 
-def test_the_result_is_printed(run: Kpenc, sets: Path) -> None:
-    code, out, err = run(sets / "blender")
+def test_the_result_is_printed(run: Kpenc, sets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    previewed: list[int] = []
+    monkeypatch.setattr(Preview, "write", lambda self, trainer, step: previewed.append(step))
+    code, out, err = run(sets / "blender", "--preview")
+    assert previewed[0] < previewed[-1] == 72
     assert code == 0 and "displaced by a motion grid of 11x11x11 nodes" in err
     assert "colour: view-independent, as trained\nchannels kept: " in err
     assert "time: 2 rows, one for 4 of 5 frames (the preset's" in err
