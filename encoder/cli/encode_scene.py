@@ -206,9 +206,9 @@ def _train(trainer: Trainer, checkpoint: Path, options: Options) -> None:
             requests.append(number)
 
     def report(state: Report) -> None:
-        show_progress(progress, state)
         if preview is not None:
             preview.update(trainer, state.step)
+        show_progress(progress, state)  # after the first preview, whose time must not be extrapolated
 
     with Progress("training", total=100, unit="%") as progress, handle_signals(note):
         try:
