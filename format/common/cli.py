@@ -100,6 +100,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     images and videos choose the file format by it.
     """
     target = Path(path)
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
     handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
     os.close(handle)
     temporary = Path(name)

@@ -309,8 +309,8 @@ class HttpSource:
             raise TemporaryFailure(
                 f"the server answers {response.status} {response.reason}", pause_s=retry_after(response)
             )
-        encoding = response.headers.get("Content-Encoding", "identity")
-        if response.status in (200, 206) and encoding != "identity":
+        encoding = response.headers.get("Content-Encoding", "").strip()
+        if response.status in (200, 206) and encoding.lower() not in ("", "identity"):
             raise self._error(
                 download,
                 f"the server sends it compressed ({encoding[:40]}), which ranges do not allow; switch that off there",

@@ -1,6 +1,7 @@
 """Options of commands that set metadata: --title and the like, and --view-limits."""
 
 import argparse
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -80,6 +81,8 @@ def with_view_limits(metadata: Metadata, wanted: str | Mapping[str, Any]) -> Met
 
 def _text(name: str) -> Any:
     def parse(text: str) -> str:
+        # Arguments are decoded as the locale says, which may be no more than ASCII; terminals send UTF-8.
+        text = os.fsencode(text).decode("utf-8", "replace")
         text = text.replace("\\n", "\n") if name == "description" else text
         try:
             pack_metadata(Metadata({name: text} if text else {}))

@@ -12,13 +12,16 @@ from typing import Any
 import numpy as np
 
 from kpc.format.common.errors import DatasetError
-from kpc.format.scene.camera_models import HIGHER_ORDERS, NO_PINHOLE_KEYS, understood_model
+from kpc.format.scene.camera_models import HIGHER_ORDERS, NO_PINHOLE_KEYS, check_unknown_keys, understood_model
 
 # Numbers of a camera lie within this magnitude: a .kpc file holds no larger ones (BOX_LIMIT of the specification).
 NUMBER_LIMIT = 2.0**30
 
 # Focal lengths as a share of the picture's larger side. The least makes a field of view of 179 degrees.
 LEAST_FOCAL, GREATEST_FOCAL = 0.01, 1e5
+
+# The most that the focal lengths of both axes differ by, as a factor. Pixels of anamorphic film differ by 2.
+GREATEST_ASPECT = 10.0
 
 # The farthest that a principal point lies from the picture's corner, in widths and heights of the picture.
 FARTHEST_CENTRE = 100
@@ -34,6 +37,14 @@ SAFETY = 1.005
 
 # Coefficients of OpenCV's lens model that are understood.
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2")
+
+# Keys of a camera in a JSON document.
+_CAMERA_KEYS = frozenset(
+    (
+        *("w", "h", "fl_x", "fl_y", "cx", "cy", "transform_matrix", "time", "at", "camera_model", "camera_type"),
+        *(*DISTORTION_KEYS, *HIGHER_ORDERS, "distortion_params"),
+    )
+)
 
 
 def number_of(where: str, keys: Mapping[str, Any], key: str, default: float | None = None) -> float:
@@ -125,6 +136,11 @@ def check_lens(
             f"{where}: a focal length of {fl_x:g} x {fl_y:g} pixels does not fit a picture of {width:g}x{height:g}; "
             "give it in pixels of that size"
         )
+    if max(fl_x, fl_y) > GREATEST_ASPECT * min(fl_x, fl_y):
+        raise DatasetError(
+            f"{where}: focal lengths of {fl_x:g} x {fl_y:g} pixels differ more than those of any lens; correct the "
+            "calibration"
+        )
     if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > FARTHEST_CENTRE:
         raise DatasetError(
             f"{where}: the principal point {cx:g}, {cy:g} lies far outside a picture of {width:g}x{height:g}; "
@@ -156,8 +172,10 @@ def check_pinhole(where: str, keys: Mapping[str, Any]) -> None:
     """Check that a camera of a JSON document is a pinhole without distortion, since renderers draw no other.
 
     Raises:
-        DatasetError: the document names another model, or coefficients of distortion that are not 0.
+        DatasetError: the document names another model, or coefficients of distortion that are not 0, or has the keys
+            of a camera in other letters.
     """
+    check_unknown_keys(where, keys, _CAMERA_KEYS, _CAMERA_KEYS | {*NO_PINHOLE_KEYS, "file", "file_path"})
     for key in ("camera_model", "camera_type"):
         if keys.get(key) is not None:
             understood_model(where, ascii(str(keys[key]))[1:-1][:80])

@@ -5,7 +5,12 @@ Understood is a pinhole with at most OpenCV's lens model k1 k2 p1 p2; whatever i
 Sources: https://colmap.github.io/cameras.html, https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
+import re
+from collections.abc import Mapping, Set
+from typing import Any
+
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import one_line
 
 # The understood models, with COLMAP's parameters in order; nerfstudio's files name the parameters themselves.
 PARAMETERS = {
@@ -28,6 +33,10 @@ NO_PINHOLE_KEYS = (
     *("is_fisheye", "fisheye", "fisheye_crop_radius", "latlong", "equirectangular", "orthographic"),
     *(f"ftheta_p{n}" for n in range(5)),
 )
+
+# Words that say that a camera is no pinhole, and the keys in whose values they are looked for.
+_NO_PINHOLE = re.compile("fish.?eye|equi.?rect|lat.?long|f.?theta|panoram|spherical|omni.?dir|vr.?180", re.IGNORECASE)
+_ABOUT_LENSES = re.compile("cam|lens|model|projection|distort", re.IGNORECASE)
 
 # COLMAP's numbers of models in binary files, so that messages can name those that are refused.
 COLMAP_NUMBERS = dict(
@@ -63,3 +72,26 @@ def check_higher_orders(where: str, distortion: dict[str, float]) -> None:
     """
     if any(distortion.get(name, 0.0) != 0 for name in HIGHER_ORDERS):
         raise DatasetError(f"{where}: distortion beyond k1 k2 p1 p2 is not supported; undistort the images")
+
+
+def check_unknown_keys(where: str, keys: Mapping[str, Any], read: Set[str], understood: Set[str]) -> None:
+    """Refuse unknown keys of a document that matter: read ones in other letters, and ones that speak of no pinhole.
+
+    Args:
+        where: the file and entry, for messages.
+        keys: the document's, or those of one of its frames.
+        read: the keys that are read.
+        understood: all keys that are known, which are not looked at.
+
+    Raises:
+        DatasetError: as above.
+    """
+    for key, value in keys.items():
+        if key in understood:
+            continue
+        if (same := key.strip().lower()) in read:
+            raise DatasetError(f"{where}: the key {key!r} is not read; write it {same}")
+        says = isinstance(value, str) and _ABOUT_LENSES.search(key) and _NO_PINHOLE.search(value)
+        if says or (value and _NO_PINHOLE.search(key)):
+            what = one_line(f"{key}: {value}" if says else key)[:160]
+            raise DatasetError(f"{where}: {what} is not supported; undistort the images to a pinhole")

@@ -45,6 +45,7 @@ def refused(*words: str) -> Any:
         (SIZE, (1e9, 1e9, 320.0, 240.0), (0, 0, 0, 0), "does not fit"),
         (SIZE, (5e-324, 500.0, 320.0, 240.0), (0, 0, 0, 0), "does not fit"),
         (SIZE, (500.0, 500.0, 1e6, 240.0), (0, 0, 0, 0), "far outside"),
+        (SIZE, (40.0, 500.0, 320.0, 240.0), (0, 0, 0, 0), "differ more"),
         ((0, 480), LENS, (0, 0, 0, 0), "empty"),
         ((1e12, 480), LENS, (0, 0, 0, 0), "too large"),
         (SIZE, LENS, (-2.0, 0, 0, 0), "folds"),
@@ -173,6 +174,9 @@ FRAME = {"w": 48, "h": 36, "fl_x": 40.0, "transform_matrix": TURNED.tolist()}
         ({"distortion_params": [0, 0, 0, 0, 0, 1e-3]}, "not rendered"),
         ({"camera_type": "equirectangular"}, "equirectangular"),
         ({"k1": 0.1}, "not rendered"),
+        ({"K1": 0.1}, "the key 'K1' is not read; write it k1"),
+        ({"lens": "fish-eye"}, "lens: fish-eye is not supported"),
+        ({"vr180": 1}, "vr180 is not supported"),
         ({"w": "48"}, "not a number"),
         ({"w": True}, "not a number"),
         ({"w": 48.5}, "whole pixels"),
@@ -187,6 +191,8 @@ def test_camera_files_are_refused_in_one_line(tmp_path: Path, change: dict[str, 
     file = tmp_path / "c.json"
     file.write_text(json.dumps({"camera_model": "OPENCV", **dict.fromkeys(DISTORTION_KEYS, 0.0), "frames": [FRAME]}))
     assert load_views(file)[0].camera.fl_x == 40.0
+    file.write_text(json.dumps({"title": "Fisheye", "frames": [FRAME | {"file": "fisheye/vr180.png"}]}))
+    assert load_views(file)[0].file == "fisheye/vr180.png"
     file.write_text(json.dumps({"frames": [FRAME, FRAME | change]}))
     with pytest.raises(DatasetError, match=rf"c\.json frame 1: [^\n]*{words}[^\n]*\Z"):
         load_views(file)

@@ -309,15 +309,32 @@ def test_a_response_shorter_than_requested_is_completed(folder: Path) -> None:
         source.close()
 
 
-def test_a_compressed_response_is_refused(folder: Path) -> None:
-    class Compressing(RecordingHandler):
+def encoding(name: str) -> type[RecordingHandler]:
+    """Return a handler that says that what it sends is encoded."""
+
+    class Encoding(RecordingHandler):
         def send_header(self, key: str, value: str) -> None:
             super().send_header(key, value)
             if key == "ETag":
-                super().send_header("Content-Encoding", "gzip")
+                super().send_header("Content-Encoding", name)
 
-    with serving(folder, handler=Compressing) as address, pytest.raises(NetworkError, match=r"compressed \(gzip\)"):
+    return Encoding
+
+
+def test_a_compressed_response_is_refused(folder: Path) -> None:
+    with (
+        serving(folder, handler=encoding("gzip")) as address,
+        pytest.raises(NetworkError, match=r"compressed \(gzip\)"),
+    ):
         HttpSource(f"{address}/data.bin")
+
+
+@pytest.mark.parametrize("name", ["", "Identity"])
+def test_a_response_that_says_that_it_is_not_compressed(folder: Path, name: str) -> None:
+    with serving(folder, handler=encoding(name)) as address:
+        source = HttpSource(f"{address}/data.bin")
+        assert source.read_at(0, 9) == DATA[:9]
+        source.close()
 
 
 def redirecting(target: Callable[[str], str]) -> type[RecordingHandler]:

@@ -1,5 +1,6 @@
 """Metadata: what a file says of itself, checked on reading and kept on writing."""
 
+import argparse
 import copy
 import json
 import sys
@@ -15,6 +16,7 @@ from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import FormatError
 from kpc.format.container import groups
 from kpc.format.container.metadata_chunk import pack_metadata, parse_metadata
+from kpc.format.container.metadata_options import add_metadata_options, members_from
 from kpc.format.container.partial import PartialScene
 from kpc.format.container.scene_io import SceneReader, encode, read
 from kpc.format.scene.metadata import Metadata, camera_document, camera_from, limits_document, merged
@@ -151,3 +153,10 @@ def test_arbitrary_bytes_are_read_or_refused(raw):
 def test_cameras_without_names_have_numbers() -> None:
     named = Metadata({"camera_names": ["left", "right"]})
     assert named.names_of(2) == ("left", "right") and named.names_of(3) == ("0", "1", "2")
+
+
+@pytest.mark.parametrize(("given", "found"), [("Gr\u00f6\u00dfe", "Gr\u00f6\u00dfe"), ("caf\udce9", "caf\ufffd")])
+def test_texts_that_are_not_in_the_encoding_of_the_terminal(given: str, found: str) -> None:
+    parser = argparse.ArgumentParser()
+    add_metadata_options(parser)
+    assert members_from(parser.parse_args(["--title", given])) == {"title": found}

@@ -401,6 +401,8 @@ def test_unknown_appearances_are_refused(
             (["{scene}", "--time", "0", "-o", f"{{dir}}/x{suffix}"], 2, f"{suffix} is not written")
             for suffix in (".gif", ".webp", ".tiff", ".avi", ".MXF", ".v2")
         ),
+        *((["{scene}", "--time", "0", "-o", name], 2, "is no name") for name in ("-", "{dir}/.png", "{dir}/x.")),
+        (["{scene}", "--time", "0", "-o", "{folder}"], 2, "film.mp4: is a folder"),
         (["{scene}", "--time", "0", "--format", "exr", "-o", "{dir}/x.png"], 2, "contradicts .png"),
         (["{scene}", "--time", "0", "--format", "png", "-o", "{dir}/x.mp4"], 2, "contradicts .mp4"),
     ],
@@ -410,6 +412,7 @@ def test_bad_input_is_one_line(
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
+    (tmp_path / "film.mp4").mkdir()
     (tmp_path / "text.kpc").write_text("not a scene")
     (tmp_path / "empty.json").write_text("{}")
     pose = np.eye(4).tolist()
@@ -423,6 +426,7 @@ def test_bad_input_is_one_line(
         "missing": tmp_path / "missing.kpc",
         "text": tmp_path / "text.kpc",
         "dir": out,
+        "folder": tmp_path / "film.mp4",
         "empty": tmp_path / "empty.json",
         "nan": tmp_path / "nan.json",
     }

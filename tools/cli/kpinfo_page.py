@@ -4,6 +4,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from kpc.format.common.text import one_line
 from kpc.format.container.http_address import printable
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import TIME_PLANES
@@ -21,8 +22,8 @@ def page(info: Mapping[str, Any]) -> str:
     """Return the page about one file: its scene where that is described, else its groups."""
     described = next((group for group in info["groups"] if group["scene"] is not None), None)
     first = f"{_sizes(info)}, format version {info['version']}" + ", verified" * info["verified"]
-    lines = [f"{info['file']}:", f"  {first}"] if len(info["file"]) + len(first) > WIDTH - 2 else []
-    lines = lines or [f"{info['file']}: {first}"]
+    name = one_line(info["file"])
+    lines = [f"{name}:", f"  {first}"] if len(name) + len(first) > WIDTH - 2 else [f"{name}: {first}"]
     sizes = described["scene"]["camera_sizes"] if described else []
     for label, text in metadata_rows(Metadata(info["metadata"]), sizes):
         lines += _item(label, printable(text))

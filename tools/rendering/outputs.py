@@ -44,6 +44,8 @@ class Output:
             UsageError: nothing of that kind can be written, or name and format contradict each other.
         """
         path, suffix = Path(text), Path(text).suffix.lower()
+        if path.name == "-" or path.name.endswith(".") or path.name.lower() in FILM_SUFFIXES + PICTURE_SUFFIXES:
+            raise UsageError(f"-o {text}: is no name of a file or folder; give one such as clip.mp4 or still.png")
         has_slash = text.endswith(tuple(filter(None, (os.sep, os.altsep))))
         if not suffix or has_slash or (path.is_dir() and not _is_of_media(text)):
             return Output(path, f".{picture_format or PICTURE_FORMATS[0]}", is_folder=True)
@@ -57,6 +59,8 @@ class Output:
                 f"-o {text}: --format {picture_format} contradicts {suffix}; leave --format out, or give a folder or a "
                 f".{picture_format}"
             )
+        if path.is_dir():
+            raise UsageError(f"-o {text}: is a folder; give another name, or {text}/ for pictures in it")
         return Output(path, suffix, is_film=suffix in FILM_SUFFIXES)
 
     def picture_paths(self, names: Sequence[str]) -> tuple[list[Path], int]:

@@ -7,14 +7,13 @@ Sources: https://docs.nerf.studio/quickstart/data_conventions.html, and `nerf_lo
 https://github.com/NVlabs/instant-ngp
 """
 
-import re
 import sys
 from pathlib import Path
 from typing import Any
 
-from kpc.encoder.datasets.capture import first_names, printable
+from kpc.encoder.datasets.capture import first_names
 from kpc.format.common.errors import DatasetError
-from kpc.format.scene.camera_models import NO_PINHOLE_KEYS
+from kpc.format.scene.camera_models import NO_PINHOLE_KEYS, check_unknown_keys
 
 # Keys that are read.
 READ = frozenset(
@@ -53,9 +52,6 @@ REFUSED = {
 
 UNDERSTOOD = READ | INFORMATION | {n for table in (WITHOUT_EFFECT, REFUSED) for names in table.values() for n in names}
 
-# What says in a key or value that is not in the tables that the camera is no pinhole.
-_NO_PINHOLE = re.compile("fish.?eye|equi.?rect|lat.?long|f.?theta|panoram|spherical|omni.?dir|vr.?180", re.IGNORECASE)
-
 
 def check_keys(file: Path, document: dict[str, Any]) -> None:
     """Name once, in one line, all keys of a document and its frames that have no effect or are unknown.
@@ -70,23 +66,10 @@ def check_keys(file: Path, document: dict[str, Any]) -> None:
             for name in names:
                 if keys.get(name):
                     raise DatasetError(f"{where}: {name} is not supported; {remedy}")
-        _check_unknown(where, keys)
+        check_unknown_keys(where, keys, READ, UNDERSTOOD)
     present = dict.fromkeys(key for keys in (document, *frames) for key in keys)  # in order, each once
     without = {reason: [name for name in names if name in present] for reason, names in WITHOUT_EFFECT.items()}
     without["unknown"] = [key for key in present if key not in UNDERSTOOD]
     parts = [f"{first_names(names)} ({reason})" for reason, names in without.items() if names]
     if parts:
         print(f"{file}: keys without effect: {'; '.join(parts)}", file=sys.stderr)
-
-
-def _check_unknown(where: str, keys: dict[str, Any]) -> None:
-    """Refuse keys that are in no table, but matter by their names or values."""
-    for key, value in keys.items():
-        if key in UNDERSTOOD:
-            continue
-        same = key.strip().lower()
-        if same in READ:
-            raise DatasetError(f"{where}: the key {key!r} is not read; write it {same}")
-        if value and _NO_PINHOLE.search(f"{key} {value}" if isinstance(value, str) else key):
-            what = f"{key}: {value}" if isinstance(value, str) else key
-            raise DatasetError(f"{where}: {printable(what)} is not supported; undistort the images to a pinhole")
