@@ -203,6 +203,7 @@ def _train(trainer: Trainer, checkpoint: Path, options: Options) -> None:
         if trainer.step == begun:
             interrupts.handle()
         else:
+            interrupts.heard()
             requests.append(number)
 
     def report(state: Report) -> None:

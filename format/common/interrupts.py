@@ -31,6 +31,7 @@ INTERRUPTED = 130
 
 _busy: list[Callable[[], bool]] = []
 _asked = _is_pending = False  # whether KeyboardInterrupt is to be raised, and whether at a safe place
+_is_heard = False  # whether the command has taken note of the first Ctrl-C by a handler of its own
 _loading: Callable[..., None] | None = None  # the handler of `ending_at_once`
 
 
@@ -45,6 +46,12 @@ def handle(*_: Any) -> None:
     _asked, _is_pending = True, any(is_busy() for is_busy in _busy)
     if not _is_pending:
         raise KeyboardInterrupt
+
+
+def heard() -> None:
+    """Say that a handler of the command's own has taken note of Ctrl-C; it may then take as long as it needs."""
+    global _is_heard
+    _is_heard = True
 
 
 def raise_pending() -> None:
@@ -79,7 +86,7 @@ def heeded(name: str) -> Iterator[None]:
     A process for which Ctrl-C is ignored, such as one in the background of a shell without job control, goes on
     ignoring it, and a handler of the caller's own stays.
     """
-    global _asked, _is_pending
+    global _asked, _is_pending, _is_heard
     is_main = threading.current_thread() is threading.main_thread()
     own = signal.getsignal(signal.SIGINT)
     if not is_main or own not in (signal.default_int_handler, handle, _loading):
@@ -96,7 +103,7 @@ def heeded(name: str) -> Iterator[None]:
     finally:
         signal.signal(signal.SIGINT, own)
         signal.set_wakeup_fd(before)
-        _asked = _is_pending = False
+        _asked = _is_pending = _is_heard = False
         writer.close()
         watcher.join()
 
@@ -104,20 +111,24 @@ def heeded(name: str) -> Iterator[None]:
 def _end_in_time(reader: socket.socket, name: str) -> None:
     """Read the numbers of signals until the other end is closed, and end the process when the command is overdue.
 
-    A handler of the command's own, such as that of training, takes as long as it needs for the first Ctrl-C.
+    A command that calls `heard`, such as training, takes as long as it needs for the first Ctrl-C.
     """
     count, overdue_at = 0, math.inf
     with reader:
         while time.monotonic() < overdue_at:
+            is_asked = _asked
             if select.select([reader], [], [], POLL_S if count else None)[0]:
                 numbers = reader.recv(64)
                 if not numbers:
                     return
                 count += sum(numbers.count(number) for number in (signal.SIGINT, signal.SIGTERM))
+                is_asked |= signal.getsignal(signal.SIGINT) is handle  # which may have to wait for compiled code
                 if count > 1:
                     overdue_at = min(overdue_at, time.monotonic() + GRACE_S)
-            if count and overdue_at == math.inf and (_asked or signal.getsignal(signal.SIGINT) is handle):
-                overdue_at = time.monotonic() + LONGEST_S
+            if count == 1 and _is_heard:
+                overdue_at = math.inf
+            elif count and is_asked:
+                overdue_at = min(overdue_at, time.monotonic() + LONGEST_S)
     end(name)
 
 

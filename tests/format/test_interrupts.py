@@ -75,6 +75,45 @@ def test_ctrl_c_ends_in_one_line(tmp_path: Path, command: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "kpx: interrupted\n")
 
 
+def test_a_handler_of_the_command_takes_as_long_as_it_needs(tmp_path: Path) -> None:
+    """As in training, which saves a checkpoint after Ctrl-C and asks whether to go on."""
+    command = """
+    import signal, time
+    import keyboard
+    from kpc.format.common import cli, interrupts
+    interrupts.LONGEST_S = 0.2
+    def patient(_):
+        before = signal.signal(signal.SIGINT, lambda *_: interrupts.heard())
+        keyboard.press()
+        signal.signal(signal.SIGINT, before)
+        time.sleep(0.7)
+        print("went on")
+    def main(argv):
+        return cli.run(patient, "kpx")
+    """
+    done = interrupted(tmp_path, command)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "went on\n", "")
+
+
+def test_what_is_lost_ends_in_time(tmp_path: Path) -> None:
+    command = """
+    import time
+    import keyboard
+    from kpc.format.common import cli, interrupts
+    interrupts.LONGEST_S = 0.2
+    def deaf(_):
+        try:
+            keyboard.press()
+            time.sleep(60)
+        except KeyboardInterrupt:
+            time.sleep(60)
+    def main(argv):
+        return cli.run(deaf, "kpx")
+    """
+    done = interrupted(tmp_path, command)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "kpx: interrupted\n")
+
+
 def test_a_command_that_is_not_interrupted_returns_its_code(tmp_path: Path) -> None:
     done = interrupted(tmp_path, "def main(argv):\n    return 3")
     assert (done.returncode, done.stdout, done.stderr) == (3, "", "")
