@@ -115,7 +115,7 @@ def test_files_are_what_their_names_say(run, scene_file: Path, tmp_path: Path, n
 
 
 def test_names_and_poses_of_nerfstudio(run, scene_file: Path, tmp_path: Path) -> None:
-    """Frames keep the names of `file_path`, also one without a suffix; equal names are reported."""
+    """Frames keep the names of `file_path`, also one without a suffix; none keeps a name that is there twice."""
     listed = cameras_json(tmp_path / "transforms.json", ["images/0007.png", "./train/r_0.5", "b/0007.png"])
     document = json.loads(listed.read_text())
     for frame in document["frames"]:
@@ -124,8 +124,8 @@ def test_names_and_poses_of_nerfstudio(run, scene_file: Path, tmp_path: Path) ->
     listed.write_text(json.dumps(document))
     words = ["--cameras", listed, "--size", "8x6", "--backend", "reference", "-o", tmp_path / "out"]
     code, _, notes = run(scene_file, *words)
-    assert code == 0 and "1 pictures get other names" in notes and "beginning of the clip" in notes
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["0007.png", "0007_0002.png", "r_0.5.png"]
+    assert code == 0 and "2 pictures get other names" in notes and "beginning of the clip" in notes
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["b_0007.png", "images_0007.png", "r_0.5.png"]
 
 
 @pytest.mark.parametrize(("fps", "at_s"), [(12, (0.0, 1.0, 2.0)), (1.5, (0.0, 2 / 3, 4 / 3))])

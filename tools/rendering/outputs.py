@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,21 +67,33 @@ class Output:
     def picture_paths(self, names: Sequence[str]) -> tuple[list[Path], int]:
         """Return the path of each picture, and how many could not keep their names.
 
-        Camera files may come from anywhere: only the last part of their names is used, and none twice.
+        Camera files may come from anywhere: only the last part of their names is used, or all of them joined where that
+        part is there twice.
         """
         if not self.is_folder:
             return [self.path], 0
+        bare = [re.split(r"[/\\]", _without_suffix(name))[-1] for name in names]
+        repeated = {stem for stem, count in Counter(map(_plain, bare)).items() if count > 1}
         paths, used, renamed = [], set[str](), 0
-        for number, whole_name in enumerate(names):
-            name = re.split(r"[/\\]", whole_name)[-1]
-            bare = name.rsplit(".", 1)[0] if _is_of_media(name) else name
-            stem = re.sub(r"[^\w.+-]", "_", bare)[:120].lstrip(".")
+        for number, name in enumerate(names):
+            stem = _plain(bare[number])
+            if stem in repeated:  # none keeps it, else the pictures of one folder would pass for those of another
+                stem = _plain(_without_suffix(name))
             if not stem or stem in used:
                 stem = f"{number:04d}" if not stem else f"{stem}_{number:04d}"
             used.add(stem)
-            renamed += stem != bare
+            renamed += stem != bare[number]
             paths.append(self.path / f"{stem}{self.suffix}")
         return paths, renamed
+
+
+def _without_suffix(name: str) -> str:
+    return name.rsplit(".", 1)[0] if _is_of_media(name) else name
+
+
+def _plain(name: str) -> str:
+    """Return a name of letters, digits and some signs, which is no path and not hidden."""
+    return re.sub(r"[^\w.+-]", "_", name)[-120:].lstrip(".")
 
 
 def _is_of_media(name: str) -> bool:
