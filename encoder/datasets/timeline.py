@@ -173,7 +173,8 @@ def _describe(
     if not differ:
         fewest, most = min(counts), max(counts)
         short = names[counts.index(fewest)]
-        some = f"videos have {fewest} ({short}) to {most} frames; the {used} in their common span are used"
+        have = f"{fewest} ({short}) to {most} frames" if fewest < most else f"{most} frames, half a frame apart"
+        some = f"videos have {have}; the {used} in their common span are used"
         return some if before + after else ""
     span_s = max(p[-1] for p in positions) / fps
     return (

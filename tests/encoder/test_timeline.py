@@ -110,6 +110,11 @@ def test_offsets_within_half_a_frame_lose_nothing(capsys: pytest.CaptureFixture[
     np.testing.assert_allclose(offsets, [0, 0.03, 0.047], atol=1e-9)
 
 
+def test_an_offset_of_half_a_frame_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    align(even(12, 10), even(12, 10, 0.05))
+    assert "videos have 12 frames, half a frame apart; the 22 of 24 in their common span are used" in said(capsys)
+
+
 def test_uneven_times_are_kept() -> None:
     n = np.arange(40)
     times = n / 30 + 0.01 * np.sin(1.7 * n)
