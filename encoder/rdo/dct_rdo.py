@@ -211,9 +211,10 @@ def search_blocks(
     with_texels = coded_blocks(coded, side)
     offsets = quantiser_offsets(weight, coded, with_texels, side)
     frequency = frequency_weights(side) / 64
+    # Arrays of one memory layout, so that the search is compiled once.
     problem = _Problem(
-        wanted,
-        weight,
+        np.ascontiguousarray(wanted),
+        np.ascontiguousarray(weight),
         coded,
         with_texels,
         offsets,
@@ -228,9 +229,10 @@ def search_blocks(
     counts = _Rates(
         np.zeros((MAGNITUDE_CONTEXTS * FREQUENCY_CLASSES, MAGNITUDE_BINS + 1)), np.zeros((END_CONTEXTS, 2 * side))
     )
-    for number in range(PASSES):
+    _transform_blocks(problem, initial, blocks.levels)
+    for _ in range(PASSES):
         bits = _Rates(_level_bits(counts.levels), _end_bits(counts.ends))
-        counts = _search(problem, blocks.levels, initial if number == 0 else None, bits, errors)
+        counts = _search(problem, blocks.levels, bits, errors)
     return blocks
 
 
@@ -295,13 +297,25 @@ def _end_bits(counts: np.ndarray) -> np.ndarray:
 
 
 @compiled()
-def _search(problem, levels, initial, bits, errors):
+def _transform_blocks(problem, initial, levels):
+    """Set the levels of all coded blocks to the transform of `initial`, wanted values of whole blocks."""
+    BY, BX = problem.coded_blocks.shape
+    N, M = len(problem.basis), problem.wanted.shape[2]
+    for m in range(M):
+        for by in range(BY):
+            for bx in range(BX):
+                if problem.coded_blocks[by, bx]:
+                    area = initial[by * N : by * N + N, bx * N : bx * N + N, m]
+                    _transform(area, problem.steps[problem.offsets[by, bx]], problem.basis, levels[m, by, bx])
+
+
+@compiled()
+def _search(problem, levels, bits, errors):
     """Search for all levels anew, and count levels and ends by context.
 
     Args:
         problem: of a segment.
         levels: (M, blocks down, blocks across, N, N) int64, from the search before; updated.
-        initial: wanted values of whole blocks, for the first search; None for later ones.
         bits: of the search before.
         errors: (H + 2, W + 2, M) float32 weighted errors; updated.
     """
@@ -329,9 +343,6 @@ def _search(problem, levels, initial, bits, errors):
                 if has_left or has_above:
                     expected = border_sum(right, bottom[bx], has_left, has_above) / 4 + expected / 2
                 predicted = math.floor(expected / step[0, 0] + 0.5)
-                if initial is not None:
-                    area = initial[by * N : by * N + N, bx * N : bx * N + N, m]
-                    _transform(area, step, problem.basis, block)
                 _load_errors(problem, scratch, from_channels, block, step, by, bx, m)
                 _descend(problem, scratch, magnitudes, bits.levels, block, step, predicted)
                 scratch.magnitudes[:] = magnitudes.here[:N, :N]

@@ -77,6 +77,7 @@ def total_distortion(errors: np.ndarray, correlation: np.ndarray) -> float:
     bordered = np.pad(errors.astype(np.float32), ((1, 1), (1, 1), (0, 0)))
     down = bordered[1:-1] + np.float32(EDGE_COUPLING) * (bordered[:-2] + bordered[2:])
     coupled = down[:, 1:-1] + np.float32(EDGE_COUPLING) * (down[:, :-2] + down[:, 2:])
+    correlation = np.ascontiguousarray(correlation)
     for m in range(errors.shape[2]):
         coupled[..., m] += cross_channel_errors(bordered, correlation, m)
     return float((errors * coupled).sum(dtype=np.float64))

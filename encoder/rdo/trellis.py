@@ -151,15 +151,16 @@ class _Search:
             many = self.mode != DEPENDENT or len(neighbours) >= MANY_SYMBOLS
             self.predictors = fit_weights(neighbours, PREDICTOR_SETS if many else 1)
             rate_costs = LAM * self._step_ratio**2 * _residual_bits(self.counts)
+            # Arrays of one memory layout, so that the search is compiled once.
             problem = Problem(
-                self.wanted,
-                self.weight,
+                np.ascontiguousarray(self.wanted),
+                np.ascontiguousarray(self.weight),
                 self.coded,
                 self.rows,
                 self.mode,
                 self.predictors,
                 rate_costs,
-                self.correlation,
+                np.ascontiguousarray(self.correlation),
             )
             self.symbols, self.counts = search(problem, self.errors)
 

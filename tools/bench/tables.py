@@ -4,6 +4,7 @@ A cell is the median over the repeats of a run.
 """
 
 import statistics
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 
 from kpc.tools.bench.records import Record, median
@@ -356,7 +357,8 @@ def tables(kind: str, records: Iterable[Record]) -> str:
         runs = sorted({len(record["repeats"]) for record in rows})
         commits = ", ".join(dict.fromkeys(_short(record["commit"]) for record in rows))
         commands = "; ".join(dict.fromkeys(f"`{record['command']}`" for record in rows))
-        parts.append(f"Commit {commits}; median of {' or '.join(map(str, runs))} run{'s' * (runs != [1])}; {commands}.")
+        source = f"Commit {commits}; median of {' or '.join(map(str, runs))} run{'s' * (runs != [1])}; {commands}."
+        parts.append(textwrap.fill(source, 120, break_long_words=False, break_on_hyphens=False))
     return "\n\n".join(parts)
 
 
