@@ -22,7 +22,7 @@ from kpc.player.cpu import reference
 from kpc.tools.vectors.metadata_vectors import FULL
 from scenes import VARIANTS, tiny_scene
 
-pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
+pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding")
 
 
 def scene_of_five():

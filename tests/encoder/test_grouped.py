@@ -39,7 +39,7 @@ from kpc.tools.bench import group_joins
 from kpc.tools.cli import kpjoin
 from training_runs import TINY
 
-pytestmark = pytest.mark.usefixtures("one_thread", "few_rays", "tiny")
+pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding", "tiny")
 FRAMES = 26
 
 

@@ -32,7 +32,7 @@ from kpc.format.scene.scene import HybridDecoder
 from kpc.format.scene.space import DeviceCoordinates
 from training_runs import TINY
 
-pytestmark = pytest.mark.usefixtures("one_thread", "few_rays", "tiny", "heeded_signals")
+pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding", "tiny", "heeded_signals")
 
 
 @pytest.fixture

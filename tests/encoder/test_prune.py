@@ -25,8 +25,16 @@ from kpc.format.scene.scene import Decoder, Scene
 from kpc.player.cpu import reference
 from scenes import VARIANTS, tiny_scene, with_appearances
 
-pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
+pytestmark = pytest.mark.usefixtures("one_thread")
 SPARE = 0.05
+
+
+@pytest.fixture(autouse=True)
+def whole_searches(quick_coding: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Search until the target is met, which these tests check."""
+    monkeypatch.setattr("kpc.encoder.rdo.rate_search.MAX_ATTEMPTS", 16)
+    monkeypatch.setattr("kpc.encoder.rdo.codec_model.TOLERANCE", 0.02)
+
 
 Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
 

@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from kpc.encoder.evaluation.validation_rays import Fidelity
-from kpc.encoder.rdo.mode_decision import quantise_by_cost
+from kpc.encoder.rdo import mode_decision
 from kpc.encoder.rdo.rate_control import (
     FINEST,
     MIN_SIGNIFICANCE,
@@ -30,6 +31,10 @@ from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 from scenes import tiny_scene
 
+# On the trellis alone, which is quicker: how modes are chosen is tested in test_mode_decision.py.
+quantise_by_cost = partial(mode_decision.quantise_by_cost, block_sides=())
+controller = partial(RateController, quantise=quantise_by_cost)
+
 
 def needed(scene: Scene) -> Scene:
     """Return the scene with all cells occupied, so that every texel is looked up."""
@@ -46,6 +51,11 @@ def alike(scene: Scene) -> list[dict[str, np.ndarray]]:
 
 SCENE = needed(tiny_scene())
 EQUAL, ALIKE = equal(SCENE), alike(SCENE)
+
+
+@pytest.fixture(autouse=True)
+def few_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kpc.encoder.rdo.trellis.PASSES", 2)
 
 
 @pytest.fixture
@@ -65,7 +75,7 @@ def measure(scene: Scene) -> Fidelity:
 
 
 def coded(**trade: float) -> Attempt:
-    return RateController(SCENE, EQUAL, ALIKE, measure, 30.0).meet(Trade(**trade))  # type: ignore[arg-type]
+    return controller(SCENE, EQUAL, ALIKE, measure, 30.0).meet(Trade(**trade))  # type: ignore[arg-type]
 
 
 def loss(found: Attempt) -> float:
@@ -116,17 +126,13 @@ def test_an_unreachable_size_gives_the_smallest_file() -> None:
     assert coded(target_bytes=10).size_bytes == coded(max_loss_db=1e9).size_bytes
 
 
-@pytest.fixture(scope="module")
-def raster() -> list[Attempt]:
-    """Attempts on a fine raster of factors, for all lambdas."""
-    return [Attempt(quantise_by_cost(SCENE, scaled(EQUAL, 2.0**e)), measure, float(e)) for e in np.arange(-10, 2, 0.1)]
-
-
-@pytest.mark.parametrize("lam", [0.01, 0.3, 10.0])
-def test_lam_minimises_the_lagrangian_cost(lam: float, raster: list[Attempt]) -> None:
-    """Nothing on the raster is cheaper by more than a little: the least is flat, and where 8 bits become too few for
-    the trellis a plane goes back to rounding, which makes the cost jump a little."""
-    assert coded(lam=lam).cost(lam) <= 1.06 * min(attempt.cost(lam) for attempt in raster)
+def test_lam_minimises_the_lagrangian_cost() -> None:
+    """Nothing on a fine raster of factors is cheaper by more than a little: the least is flat, and where 8 bits become
+    too few for the trellis a plane goes back to rounding, which makes the cost jump a little."""
+    exponents = np.arange(-10, 2, 0.2)
+    raster = [Attempt(quantise_by_cost(SCENE, scaled(EQUAL, 2.0**e)), measure, float(e)) for e in exponents]
+    for lam in (0.01, 0.3, 10.0):
+        assert coded(lam=lam).cost(lam) <= 1.06 * min(attempt.cost(lam) for attempt in raster)
 
 
 def test_a_larger_lam_gives_a_smaller_file() -> None:
@@ -146,7 +152,7 @@ def test_nan_does_not_meet_a_target() -> None:
         seen.append(scene)
         return measure(scene) if len(seen) < 3 else Fidelity(math.nan, math.nan)
 
-    found = RateController(SCENE, EQUAL, ALIKE, broken, 30.0).meet(Trade(0.15))
+    found = controller(SCENE, EQUAL, ALIKE, broken, 30.0).meet(Trade(0.15))
     assert math.isfinite(found.measured.psnr) and found.size_bytes > 0
 
 
@@ -155,13 +161,11 @@ def test_a_file_is_never_coded_with_finer_steps() -> None:
     own = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in whole.scales]
     size = len(scene_io.encode(whole))
     for trade in (Trade(quality=100), Trade(target_bytes=size), Trade(max_loss_db=1e-9)):
-        judged = RateController(whole.dequantise(), own, ALIKE, measure, measure(whole.dequantise()).psnr, whole).meet(
+        judged = controller(whole.dequantise(), own, ALIKE, measure, measure(whole.dequantise()).psnr, whole).meet(
             trade
         )
         assert judged.quantised is whole
-    smaller = RateController(whole.dequantise(), own, ALIKE, measure, 30.0, whole).meet(
-        Trade(target_bytes=int(0.8 * size))
-    )
+    smaller = controller(whole.dequantise(), own, ALIKE, measure, 30.0, whole).meet(Trade(target_bytes=int(0.8 * size)))
     assert 0.7 * size < smaller.size_bytes <= 0.8 * size
 
 
@@ -206,7 +210,7 @@ def test_channels_without_significance_get_the_coarsest_step() -> None:
 def test_steps_are_equal_where_nothing_has_significance() -> None:
     nothing = significance([{name: np.zeros_like(plane) for name, plane in scale.items()} for scale in SCENE.scales])
     assert len({float(step) for scale in relative_steps(nothing) for steps in scale.values() for step in steps}) == 1
-    assert math.isfinite(RateController(SCENE, EQUAL, nothing, measure, 30.0).meet(Trade()).measured.psnr)
+    assert math.isfinite(controller(SCENE, EQUAL, nothing, measure, 30.0).meet(Trade()).measured.psnr)
 
 
 @pytest.mark.parametrize("error, common, slots", [(1.0, 100, 1), (1.0, 50, 2), (0.1, 100, 4)])
@@ -261,7 +265,7 @@ def tuned_to(factor: float, seen: list[Attempt] | None = None, power: float = 1.
             seen.append(Attempt(made, measure, 0.0))
         return made
 
-    return RateController(SCENE, EQUAL, ALIKE, measure, 30.0, tune=tune).meet(Trade(**trade))  # type: ignore[arg-type]
+    return controller(SCENE, EQUAL, ALIKE, measure, 30.0, tune=tune).meet(Trade(**trade))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("factor", [0.6, 0.85])
@@ -299,5 +303,5 @@ def test_failed_fine_tuning_leaves_the_untuned_coding() -> None:
     def tune(steps: Steps, reached: np.ndarray) -> QuantisedScene:
         return replace(quantise_by_cost(SCENE, steps, reached), step=7.0)
 
-    found = RateController(SCENE, EQUAL, ALIKE, broken, 30.0, tune=tune).meet(Trade(0.15))
+    found = controller(SCENE, EQUAL, ALIKE, broken, 30.0, tune=tune).meet(Trade(0.15))
     assert found.quantised.step != 7 and 0.07 < loss(found) <= 0.15

@@ -37,7 +37,7 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def choose(scene: Scene, group: Sequence[PlaneKey] | None = None) -> QuantisedScene:
     steps = [{name: np.full(plane.shape[2], STEP) for name, plane in scale.items()} for scale in scene.scales]
-    return quantise_by_cost(scene, steps, only=group)
+    return quantise_by_cost(scene, steps, only=group, block_sides=(8,))
 
 
 def error(scene: Scene, quantised: QuantisedScene) -> float:

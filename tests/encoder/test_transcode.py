@@ -29,7 +29,7 @@ from kpc.player.cpu import reference
 from scenes import VARIANTS, tiny_scene, with_appearances
 from training_runs import TINY
 
-pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
+pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding")
 
 VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "valid"
 Kpenc = Callable[..., dict[str, Any]]

@@ -35,13 +35,18 @@ class RecordingHandler(Handler):
 
 @pytest.fixture(autouse=True)
 def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Retry without long pauses; afterwards collect garbage, so that a connection left open raises a warning."""
+    """Retry without long pauses; afterwards collect garbage, so that a connection left open raises a warning.
+
+    What earlier tests left is not looked through, which would take seconds.
+    """
     monkeypatch.setattr(http, "FIRST_PAUSE_S", 0.01)
     monkeypatch.setattr(http_client, "CONNECT_TIMEOUT_S", 2.0)
     monkeypatch.setattr(http_client, "READ_TIMEOUT_S", 2.0)
     RecordingHandler.ranges.clear()
+    gc.freeze()
     yield
     gc.collect()
+    gc.unfreeze()
 
 
 @pytest.fixture

@@ -79,7 +79,7 @@ def test_pictures_are_those_of_the_reference(kind: type, where: str, view: Camer
         scene = replace(scene, decoder=replace(scene.decoder, density_bias=60.0))
     elif where == "fog":
         weight = 0.02 * scene.decoder.density_weight
-        scene = replace(scene, step=0.002, decoder=replace(scene.decoder, density_bias=0.0, density_weight=weight))
+        scene = replace(scene, step=0.004, decoder=replace(scene.decoder, density_bias=0.0, density_weight=weight))
     renderer = renderer_of(scene, kind)
     for time in (0.0, 0.6, 1.0):
         got, wanted = renderer.render(view, time), render(scene, view, time)
