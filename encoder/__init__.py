@@ -1,4 +1,6 @@
-"""The encoder: from posed pictures to a .kpc file. It needs PyTorch and PyAV (the extra `kpc[encoder]`)."""
+"""The encoder: from posed pictures to a .kpc file. It needs PyTorch, PyAV and numba (the extra
+`kpc[encoder]`).
+"""
 
 import sys
 
@@ -14,7 +16,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         from kpc.encoder.cli import kpenc
     except ModuleNotFoundError as error:
-        if error.name not in ("torch", "av"):
+        if error.name not in ("torch", "av", "numba"):
             raise
         remedy = 'in a checkout of KPC, pip install ".[encoder]"'
         print(f"kpenc: needs {error.name}, which is not installed; {remedy}", file=sys.stderr)

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from kpc.format.coding.predictive import DEPENDENT, PredictionWeights, trellis_transition
-from kpc.format.coding.transform import OFFSET_COUNT, TransformBlocks, coded_blocks
+from kpc.encoder.coding.predictive import trellis_transition
+from kpc.encoder.coding.transform import OFFSET_COUNT, TransformBlocks, coded_blocks
+from kpc.format.container.segments import DEPENDENT, PredictionWeights
 from kpc.tools.vectors.scenes import walked
 
 PLANE_PATTERNS = {

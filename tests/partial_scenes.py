@@ -1,9 +1,10 @@
 """Small scenes in files, and scenes that are read from them segment by segment."""
 
 import kpc
+from kpc.encoder.coding.scene_writer import encode
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.partial import PartialScene
-from kpc.format.container.scene_io import SceneReader, encode
+from kpc.format.container.scene_io import SceneReader
 from kpc.format.scene.scene import Scene
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 import gl
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.images import read_image
-from kpc.format.container.scene_io import write
 from kpc.format.scene.cameras import load_views
 from scenes import tiny_scene
 

@@ -6,10 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kpc.format.coding.predictive import SCALAR, WEIGHT_COUNT, decode_symbols, encode_with_weights
+from core_decoders import decode_symbols
+from kpc.encoder.coding.predictive import encode_with_weights
+from kpc.encoder.coding.scene_writer import encode
 from kpc.format.coding.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_scene
 from kpc.format.common.errors import BudgetError
-from kpc.format.container.scene_io import encode, read
+from kpc.format.container.scene_io import read
+from kpc.format.container.segments import SCALAR, WEIGHT_COUNT
 from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.scene.scene import SPACE_PLANES, Scene
 from scenes import tiny_scene

@@ -1,7 +1,7 @@
 """No module of kpc imports itself through others, and the folders of the player import each other in one direction.
 
 Imports inside functions count like those at the top of a module: they would only hide a cycle. Importing a package
-implicitly, as `import kpc.format.coding.rans` does with `kpc.format`, does not count.
+implicitly, as `import kpc.encoder.coding.rans` does with `kpc.format`, does not count.
 """
 
 import ast
@@ -20,7 +20,7 @@ PLAYER_LAYERS = ("kpc.player.cpu", "kpc.player.gl", "kpc.player.streaming", "kpc
 @cache
 def modules() -> dict[str, Path]:
     """Return the file of each module of kpc by its name."""
-    found = {"kpc": ROOT / "src" / "kpc" / "__init__.py"}
+    found = {"kpc": ROOT / "src" / "kpc" / "__init__.py", "kpc.jit": ROOT / "src" / "kpc" / "jit.py"}
     for package in PACKAGES:
         for file in sorted((ROOT / package).rglob("*.py")):
             parts = file.relative_to(ROOT).with_suffix("").parts

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 
 import kpc
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
-from kpc.format.container.scene_io import write
 from scenes import tiny_scene
 
 
@@ -25,7 +25,7 @@ def test_the_example_of_the_docstring(tmp_path):
 def test_importing_kpc_loads_neither_torch_nor_opengl():
     program = (
         "import sys, kpc, kpc.format.container.scene_io; "
-        "print([m for m in ('torch', 'moderngl', 'glfw') if m in sys.modules])"
+        "print([m for m in ('torch', 'numba', 'moderngl', 'glfw') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -70,6 +70,7 @@ sys.meta_path.insert(0, Nowhere())
 
 
 WITHOUT_TORCH = without("torch")
+WITHOUT_NUMBA = without("numba", "llvmlite")
 
 
 VIEWERS = (
@@ -83,6 +84,31 @@ VIEWERS = (
         "tools.cli.contactsheet",
     ),
 )
+
+
+@pytest.mark.parametrize("module", (*VIEWERS, "tools.cli.kpedit", "tools.cli.kpjoin", "tools.cli.kpexport"))
+def test_viewers_need_no_numba(module: str) -> None:
+    subprocess.run([sys.executable, "-c", f"{WITHOUT_NUMBA}\nimport kpc.{module}"], check=True)
+
+
+def run_without_numba(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    program = f"{WITHOUT_NUMBA}\nimport kpc.{module} as c; sys.exit(c.main({list(arguments)}))"
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+
+
+def test_reading_needs_no_numba(tmp_path: Path) -> None:
+    sample = str(ROOT / "samples" / "default.kpc")
+    assert run_without_numba("tools.cli.kpinfo", "--verify", sample).returncode == 0
+    picture = ("--backend", "reference", "--time", "0.5", "--size", "16x12", "-o", str(tmp_path / "a.png"))
+    assert run_without_numba("tools.cli.kprender", sample, *picture).returncode == 0
+    titled = run_without_numba("tools.cli.kpedit", sample, "-o", str(tmp_path / "a.kpc"), "--title", "A corner")
+    assert titled.returncode == 0 and (tmp_path / "a.kpc").stat().st_size > 1000
+
+
+def test_writing_without_numba_is_one_line(tmp_path: Path) -> None:
+    sample, cut = str(ROOT / "samples" / "default.kpc"), str(tmp_path / "cut.kpc")
+    done = run_without_numba("tools.cli.kpedit", sample, "-o", cut, "--to", "0.5")
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and 'pip install ".[cpu]"' in done.stderr
 
 
 @pytest.mark.parametrize("module", VIEWERS)

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kpc.format.coding import poses, rans
+from kpc.encoder.coding import rans
+from kpc.format.coding import poses
 from kpc.format.container import container as package_container
-from kpc.format.container import metadata_chunk, scene_layout, segments
+from kpc.format.container import metadata_chunk, scene_layout
+from kpc.format.core import decoding
 from kpc.format.scene import scene, space
 
 SPEC = Path(__file__).parent.parent / "spec"
@@ -224,7 +226,7 @@ def test_the_package_decodes_the_worked_examples():
         (container.TRANSFORM, trace.TRANSFORM_EXAMPLE, 4, 8),
     ):
         _, expected = trace.traced_segment(codec, body, rows, columns)
-        symbols, coded = segments.decode_segment(codec, body, rows, columns, 1)
+        symbols, coded = decoding.decode_segment(codec, body, rows, columns, 1)
         assert {(y, x, 0): int(symbols[y, x, 0]) for y, x in np.argwhere(coded).tolist()} == expected
 
 

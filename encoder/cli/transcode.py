@@ -15,7 +15,7 @@ from kpc.encoder.rdo import codec_model
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.common.version import VERSION
-from kpc.format.container import groups, scene_io
+from kpc.format.container import groups, rewriting, scene_io
 from kpc.format.container.container import MAGIC
 from kpc.format.container.metadata_options import with_view_limits
 from kpc.format.container.rewriting import with_metadata
@@ -55,7 +55,7 @@ def transcode(options: Options) -> dict[str, Any]:
     data = coded.data
     if coded.scene is source.coded:  # nothing was coded anew, and what was measured of the file holds
         data = with_metadata(data, before.with_members(**options.members))
-    size = scene_io.save(data, options.output)
+    size = rewriting.save(data, options.output)
     return {
         "file": str(options.output), "source": str(options.source),
         **coding_figures(coded, size, options.trade, EVALUATED_ON[is_coded]),

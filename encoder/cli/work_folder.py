@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from kpc.format.common.errors import TrainingError, UsageError
-from kpc.format.container import scene_io
+from kpc.format.container import rewriting
 
 CHECKPOINT = "checkpoint.kpck"
 
@@ -57,7 +57,7 @@ def save_scene(data: bytes, output: Path, work: Path) -> int:
         TrainingError: it cannot be written; the message says how to keep what was trained.
     """
     try:
-        return scene_io.save(data, output)
+        return rewriting.save(data, output)
     except OSError as error:
         kept = f", or give another -o with --work {work} --resume to keep what is trained"
         raise TrainingError(f"{output}: {error.strerror}; make room there{kept}") from error

@@ -1,4 +1,4 @@
-"""Rate-distortion optimised quantisation of planes in transform blocks (`kpc.format.coding.transform`).
+"""Rate-distortion optimised quantisation of planes in transform blocks (`kpc.encoder.coding.transform`).
 
 For each block in turn those levels are sought, one after the other, that minimise J = D + lambda R:
 
@@ -9,7 +9,7 @@ with the distortion weights of `kpc.encoder.rdo.distortion`; what is wanted is m
 other channels. The basis functions are orthogonal only where all texels weigh the same and all are needed. So the
 search keeps the error that all levels of a block make together, and chooses each level where the others are
 (coordinate descent). How visible an error is depends on its frequency
-(`kpc.format.coding.transform.frequency_weights`). Then the highest frequencies are removed as long as that pays. Bits
+(`kpc.encoder.coding.transform.frequency_weights`). Then the highest frequencies are removed as long as that pays. Bits
 are those of the entropy coder's contexts, estimated from the result of the search before; the first search starts
 from the transform of the plane itself, with texels that are not needed filled in from around.
 
@@ -24,11 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kpc.encoder.rdo.curvature import BLOCK_SIDE
-from kpc.encoder.rdo.distortion import LAM, cross_channel_errors, distortion_weights, magnitude_bits
-from kpc.encoder.rdo.texel_map_rdo import choose_coded_texels
-from kpc.format.coding.quantise import QuantisedPlane, bfloat16_ceil, quantise_plane
-from kpc.format.coding.transform import (
+from kpc.encoder.coding.transform import (
     DEFAULT_OFFSET,
     END_CONTEXTS,
     FREQUENCY_CLASSES,
@@ -40,7 +36,6 @@ from kpc.format.coding.transform import (
     border_sum,
     coded_blocks,
     dct_basis,
-    decode_blocks,
     empty_magnitudes,
     encode_blocks,
     end_context,
@@ -51,8 +46,14 @@ from kpc.format.coding.transform import (
     predict_mean,
     step_table,
 )
-from kpc.format.common.jit import compiled, inlined
+from kpc.encoder.rdo.curvature import BLOCK_SIDE
+from kpc.encoder.rdo.distortion import LAM, cross_channel_errors, distortion_weights, magnitude_bits
+from kpc.encoder.rdo.texel_map_rdo import choose_coded_texels
+from kpc.format.coding.quantise import QuantisedPlane, bfloat16_ceil, quantise_plane
+from kpc.format.container.container import Codec
 from kpc.format.container.segments import TransformSegments, rows_per_segment
+from kpc.format.core.decoding import decode_segment
+from kpc.jit import compiled, inlined
 
 # Figures behind these constants: docs/design/rate-distortion.md, "Transform blocks".
 TRANSFORM_LAM = 0.03  # lambda, in squared quantisers
@@ -88,7 +89,7 @@ def transform_quantise(
         identity: whether texels that are not coded are 1 (a time plane).
         correlation: as for `kpc.encoder.rdo.trellis.trellis_quantise`.
         side: of the blocks; smaller where a segment is small.
-        implied: as for `kpc.format.coding.transform.encode_blocks`, for the plane.
+        implied: as for `kpc.encoder.coding.transform.encode_blocks`, for the plane.
         needed: the texels to code, of a time plane; None to choose them (`kpc.encoder.rdo.texel_map_rdo`).
 
     Returns:
@@ -123,7 +124,7 @@ def transform_quantise(
         implied_here = None if implied is None else implied[own]
         bodies[start] = encode_blocks(blocks, coded_here, implied_here)
         own_rows, columns, channels = symbols[own].shape
-        symbols[own], _ = decode_blocks(bodies[start], own_rows, columns, channels, implied=implied_here)
+        symbols[own], _ = decode_segment(Codec.TRANSFORM, bodies[start], own_rows, columns, channels, implied_here)
     found = replace(finer, symbols=symbols, coded=coded, side_info=TransformSegments(bodies), starts=tuple(bodies))
     return found, sum(map(len, bodies.values()))
 

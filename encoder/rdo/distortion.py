@@ -18,7 +18,7 @@ R is in bits, and lambda is LAM.
 import numpy as np
 
 from kpc.encoder.rdo.curvature import BLOCK_SIDE
-from kpc.format.common.jit import compiled
+from kpc.jit import compiled
 
 PlaneKey = tuple[int, str]  # a plane: scale and name
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from kpc.encoder.coding import scene_writer
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.training.checkpoint import save_state
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import FormatError, TrainingError
-from kpc.format.container import scene_io
 from kpc.format.container.metadata_chunk import pack_metadata, parse_metadata
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Appearance, Clip, Decoder, HybridDecoder, Scene
@@ -78,7 +78,7 @@ def read_checkpoint(path: Path) -> tuple[Scene, ValidationRays]:
         validation = ValidationRays(**state["validation_rays"])
         _check(scene, validation)
         # A scene that no .kpc file can hold is refused here, by the rules of the reader, before anything is rendered.
-        scene_io.scene_chunks(
+        scene_writer.scene_chunks(
             quantise_scene(scene, [dict.fromkeys(scale, 8.0) for scale in scene.scales], skip_unseen=False)
         )
     except (TrainingError, OSError):

@@ -1,6 +1,6 @@
 """Quantisation of a motion grid: as coarse as pictures permit, with symbols chosen by rate and distortion.
 
-Symbols are found in coding order (`kpc.format.coding.motion_codec`), in several searches; of several candidates each
+Symbols are found in coding order (`kpc.encoder.coding.motion_codec`), in several searches; of several candidates each
 is the one that minimises the Lagrangian cost
 
     u^2 + 2 u * sum over neighbours of EDGE_COUPLING^distance * their u
@@ -17,12 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kpc.encoder.coding.motion_codec import CONTEXTS, coding_passes, interpolate, neighbour_residuals, residual_context
 from kpc.encoder.evaluation.validation_rays import Measure
 from kpc.encoder.rdo.distortion import EDGE_COUPLING, magnitude_bits
-from kpc.format.coding.motion_codec import CONTEXTS, coding_passes, interpolate, neighbour_residuals, residual_context
-from kpc.format.common.jit import compiled, inlined
 from kpc.format.scene.motion import FINEST_STEP
 from kpc.format.scene.scene import Scene
+from kpc.jit import compiled, inlined
 
 # Figures behind these constants: docs/design/rate-distortion.md, "Motion".
 SHARE = 0.1  # of the allowed error that displacements may take
@@ -104,7 +104,7 @@ class _Grid(NamedTuple):
 
 
 class _Nodes(NamedTuple):
-    """The nodes of a pass, as in `kpc.format.coding.motion_codec.CodingPass`."""
+    """The nodes of a pass, as in `kpc.encoder.coding.motion_codec.CodingPass`."""
 
     new: np.ndarray
     references: np.ndarray

@@ -1,6 +1,6 @@
 """Choice of the occupied cells by rate and distortion, within what pictures and a renderer's time allow.
 
-The boundary of a trained occupancy is ragged by chance, and that takes bits (`kpc.format.coding.occupancy_codec`). A
+The boundary of a trained occupancy is ragged by chance, and that takes bits (`kpc.encoder.coding.occupancy_codec`). A
 cell may be flipped if that costs less than it saves: one that holds next to nothing may be marched, and then shows
 that; one that hardly gives any ray its colour may be empty. Cells are flipped one by one, in several passes, where
 that reduces
@@ -16,14 +16,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from kpc.encoder.coding.occupancy_codec import CONTEXTS, NEIGHBOURS
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import Measure, ValidationRays
 from kpc.encoder.field.fused import march_scene
-from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS
-from kpc.format.common.jit import compiled, inlined
 from kpc.format.common.progress import progress
 from kpc.format.scene.grid import dilate
 from kpc.format.scene.scene import Scene
+from kpc.jit import compiled, inlined
 
 # Figures behind these constants: docs/design/rate-distortion.md, "Occupancy".
 MARCH_BITS = 0.5  # bits that may be spent to have one cell less to march
@@ -185,7 +185,7 @@ def _flip(cells, bits, occupied, neighbours):
 
 @inlined
 def context_at(cells, s, z, y, x, neighbours):
-    """Return the context of a cell, as in `kpc.format.coding.occupancy_codec`."""
+    """Return the context of a cell, as in `kpc.encoder.coding.occupancy_codec`."""
     S, Z, Y, X = cells.shape
     context = 0
     for k in range(len(neighbours)):

@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
+from kpc.encoder.coding import scene_writer
 from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, mse_of_psnr
 from kpc.encoder.field.occupancy_grid import merge_slots
 from kpc.encoder.rdo.curvature import PerPlane
@@ -28,7 +29,6 @@ from kpc.format.coding.quantise import (
     looked_up_cells,
     round_decoder,
 )
-from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 
 # Base-two logarithms of the factors on all steps, between which one is searched for a trained scene.
@@ -139,7 +139,7 @@ class Attempt:
     @cached_property
     def data(self) -> bytes:
         """The encoded file."""
-        return scene_io.encode(self.quantised)
+        return scene_writer.encode(self.quantised)
 
     @property
     def size_bytes(self) -> int:

@@ -1,7 +1,7 @@
 """Choice of the coded texels of a time plane, and so of its significance map, by rate and distortion.
 
 A texel that is not coded is 1, the identity. Whether a texel is coded takes bits, too, in the significance map
-(`kpc.format.coding.texel_map.code_map`): few where the texels around it are alike, many where it differs. So the map
+(`kpc.encoder.coding.texel_map.code_map`): few where the texels around it are alike, many where it differs. So the map
 is sought that minimises J = D + lambda R,
 
     sum over texels that are not coded of the sum over channels of weight * (distance from 1)^2
@@ -13,8 +13,8 @@ bits estimated from the map of the pass before.
 
 import numpy as np
 
-from kpc.format.coding.texel_map import MAP_CONTEXTS
-from kpc.format.common.jit import compiled, inlined
+from kpc.encoder.coding.texel_map import MAP_CONTEXTS
+from kpc.jit import compiled, inlined
 
 # Figures behind these constants: docs/design/rate-distortion.md, "Significance maps".
 IDENTITY_TOLERANCE = 0.6  # weighted squared steps, mean over channels, up to which a texel becomes the identity
@@ -66,7 +66,7 @@ def _contexts(coded):
 
 @inlined
 def map_context(coded, y, x):
-    """Return the context of a texel as in `kpc.format.coding.texel_map.code_map`: a bit for each coded neighbour.
+    """Return the context of a texel as in `kpc.encoder.coding.texel_map.code_map`: a bit for each coded neighbour.
 
     These are two texels to the left, five above and three in the row above those.
     """

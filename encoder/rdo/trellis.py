@@ -1,7 +1,7 @@
 """Trellis-coded quantisation of planes with a Lagrangian cost.
 
 On the trellis, symbols lie half as far apart as with uniform quantisation of the same rate, but along a row only
-every other symbol may follow (`kpc.format.coding.predictive.next_trellis_state`). A Viterbi search finds the path
+every other symbol may follow (`kpc.encoder.coding.predictive.next_trellis_state`). A Viterbi search finds the path
 through a row of least cost J = D + lambda R (`kpc.encoder.rdo.distortion`): for each symbol it adds
 
     u^2 + 2 u (EDGE_COUPLING * sum of u of the four adjacent texels
@@ -25,25 +25,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kpc.encoder.rdo.distortion import (
-    CORNER_COUPLING,
-    EDGE_COUPLING,
-    LAM,
-    NO_CORRELATION,
-    cross_channel_errors,
-    distortion_weights,
-    magnitude_bits,
-)
-from kpc.encoder.rdo.texel_map_rdo import choose_coded_texels
-from kpc.format.coding.predictive import (
+from kpc.encoder.coding.predictive import (
     ACTIVITIES,
-    DEPENDENT,
     FLAT_ACTIVITY,
     GRADIENT_CLASSES,
     INITIAL_RESIDUAL,
-    SCALAR,
-    TRELLIS,
-    PredictionWeights,
     activity,
     begin_row,
     collect_neighbours,
@@ -56,9 +42,19 @@ from kpc.format.coding.predictive import (
     tap_weights,
     update_cross_channel,
 )
+from kpc.encoder.rdo.distortion import (
+    CORNER_COUPLING,
+    EDGE_COUPLING,
+    LAM,
+    NO_CORRELATION,
+    cross_channel_errors,
+    distortion_weights,
+    magnitude_bits,
+)
+from kpc.encoder.rdo.texel_map_rdo import choose_coded_texels
 from kpc.format.coding.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, bfloat16_ceil, quantise_plane
-from kpc.format.common.jit import compiled
-from kpc.format.container.segments import rows_per_segment
+from kpc.format.container.segments import DEPENDENT, SCALAR, TRELLIS, PredictionWeights, rows_per_segment
+from kpc.jit import compiled
 
 # Figures behind these constants: docs/design/rate-distortion.md, "Trellis-coded quantisation".
 LOW_RATE_BITS = 1.3  # bits per symbol below which the trellis is followed only around predictions that are not flat
@@ -194,7 +190,7 @@ class Problem(NamedTuple):
         weight: (H, W, M) float32 distortion weights.
         coded: (H, W) bool.
         rows: rows per segment; segments are predicted independently.
-        mode: TRELLIS, DEPENDENT or SCALAR (`kpc.format.coding.predictive`).
+        mode: TRELLIS, DEPENDENT or SCALAR (`kpc.encoder.coding.predictive`).
         predictors: prediction weights.
         rate_costs: (contexts, MAGNITUDE_BINS), lambda times the bits of a residual.
         correlation: as for `trellis_quantise`.
@@ -211,7 +207,7 @@ class Problem(NamedTuple):
 
 
 class _Prediction(NamedTuple):
-    """State of the predictor; names of neighbours as in `kpc.format.coding.predictive`.
+    """State of the predictor; names of neighbours as in `kpc.encoder.coding.predictive`.
 
     Attributes:
         v: (3, W + 4) int32, symbols of this row and the two above, by row modulo 3.

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from kpc.format.coding.poses import are_rigid, round_poses
-from kpc.format.coding.weights import FINEST
 from kpc.format.common.errors import FormatError
-from kpc.format.common.jit import compiled
 from kpc.format.container.segments import PlaneSideInfo
+from kpc.format.core.decoding import implied_rows
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.motion import QuantisedMotion, quantise_motion, reached_cells
@@ -29,6 +28,7 @@ SYMBOL_MIN, SYMBOL_MAX = -128, 127
 # Magnitude of any plane value: float16 holds it, and with float16 weights no feature, density or colour overflows.
 VALUE_LIMIT = 2048.0
 HALF_BITS = 11  # significant bits of a float16
+FINEST = -24  # exponent of the smallest float16 above 0
 COARSEST_STEP = 8.0  # coarser steps count as this one; 128 of it stay within the limit
 # Significant bits of focal lengths and principal points: an image of 1000 pixels is shifted by a hundredth of a pixel.
 CAMERA_BITS = 16
@@ -266,7 +266,7 @@ def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) ->
         occupancy: (slots, Nz, Ny, Nx) bool.
         plane: its name, such as "xy" or "zt".
     """
-    return needed_rows(project_occupancy(occupancy, plane), rows, columns, range(rows))
+    return implied_rows(project_occupancy(occupancy, plane), rows, columns, range(rows))
 
 
 def project_occupancy(occupancy: np.ndarray, plane: str) -> np.ndarray:
@@ -276,43 +276,6 @@ def project_occupancy(occupancy: np.ndarray, plane: str) -> np.ndarray:
     others = tuple(axis for axis in range(4) if axis not in (across, down))
     projected = np.asarray(occupancy.any(axis=others))  # the kept axes stay in the order t, z, y, x
     return projected if down < across else np.ascontiguousarray(projected.T)
-
-
-def needed_rows(projected: np.ndarray, rows: int, columns: int, some: range) -> np.ndarray:
-    """Return some rows of `needed_texels` from `project_occupancy`, in no more memory than these rows take."""
-    needed = np.empty((len(some), columns), bool)
-    _mark_needed(
-        projected,
-        _touching_cells(rows, projected.shape[0])[:, some.start : some.stop],
-        _touching_cells(columns, projected.shape[1]),
-        needed,
-    )
-    return needed
-
-
-@compiled()
-def _mark_needed(projected, down, across, needed):
-    """Fill `needed`: whether any cell is set from down[0] to before down[1] and from across[0] to before across[1]."""
-    for row in range(needed.shape[0]):
-        any_below = np.zeros(projected.shape[1], np.bool_)
-        for cells in range(down[0, row], down[1, row]):
-            any_below |= projected[cells]
-        for column in range(needed.shape[1]):
-            needed[row, column] = False
-            for cell in range(across[0, column], across[1, column]):
-                needed[row, column] |= any_below[cell]
-
-
-def _touching_cells(texels: int, cells: int) -> np.ndarray:
-    """Return (2, texels) int64: the first cell and the one after the last that touch the support of each texel.
-
-    Cell c spans [c, c + 1] / cells, the support of texel i is the closed interval [i - 1, i + 1] / (texels - 1).
-    """
-    i, apart = np.arange(texels), texels - 1
-    if apart == 0:
-        return np.array([[0], [cells]])
-    first, last = -(-(i - 1) * cells // apart) - 1, (i + 1) * cells // apart
-    return np.stack([np.maximum(first, 0), np.minimum(last + 1, cells)])
 
 
 def round_decoder(decoder: AnyDecoder, bits: Mapping[str, int] | None = None) -> AnyDecoder:

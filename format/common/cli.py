@@ -20,6 +20,9 @@ from kpc.format.common.errors import KpcError, UsageError
 from kpc.format.common.text import valid_unicode
 from kpc.format.common.version import VERSION
 
+# Packages that only some extras bring, with one that does.
+EXTRAS = {"numba": "cpu", "llvmlite": "cpu"}
+
 
 def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None = None) -> int:
     """Run a command and turn the exceptions it raises into an exit code and one line on stderr.
@@ -43,6 +46,11 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         return _fail(name, str(error), 2)
     except KpcError as error:
         return _fail(name, str(error), 1)
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        remedy = f'in a checkout of KPC, pip install ".[{EXTRAS[error.name]}]"'
+        return _fail(name, f"needs {error.name}, which is not installed; {remedy}", 1)
     except (KeyboardInterrupt, SystemError) as error:
         # A Ctrl-C that arrives inside a compiled function surfaces as a SystemError.
         if not any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):

@@ -88,30 +88,10 @@ class SafePlaces:
             interrupts.raise_pending()
 
 
-# Monitors this process, from the import of `kpc.format.common.jit` on.
+# Monitors this process, from the import of `kpc.jit` on, which alone imports numba.
 MONITOR = CompilationMonitor()
 
 
 def working_s() -> float:
     """Return the seconds of a clock that stands still while numba compiles."""
     return time.monotonic() - MONITOR.spent_s
-
-
-def register() -> None:
-    """Have numba report its compilations to MONITOR, and let Ctrl-C end them where that is safe."""
-    from numba.core import event  # here, so that what shows progress need not load numba
-
-    class Listener(event.Listener):  # type: ignore[misc]
-        def __init__(self, target: CompilationMonitor | SafePlaces) -> None:
-            self.target = target
-
-        def on_start(self, event: event.Event) -> None:
-            self.target.on_start(event)
-
-        def on_end(self, event: event.Event) -> None:
-            self.target.on_end(event)
-
-    places = SafePlaces()
-    for kind, target in (("numba:compile", MONITOR), (LOCK, places), ("numba:run_pass", places)):
-        event.register(kind, Listener(target))
-    interrupts.defer_while(places.is_busy)

@@ -1,7 +1,9 @@
 """A file made of another: chunks are copied as they are stored, but for those that change."""
 
+import os
 from collections.abc import Mapping
 
+from kpc.format.common.cli import atomic_write
 from kpc.format.container.container import Chunk, Reader, StoredChunk, assemble, store
 from kpc.format.container.metadata_chunk import pack_metadata
 from kpc.format.container.sources import AnySource
@@ -28,6 +30,16 @@ def with_chunks(reader: Reader, changed: Mapping[str, Chunk | None]) -> bytes:
         later = (k for k, other in enumerate(stored) if rank(other.entry.kind) > rank(chunk.kind))
         stored.insert(next(later, len(stored)), store(chunk))
     return assemble(stored, reader.header.value_count)
+
+
+def save(data: bytes, path: str | os.PathLike[str]) -> int:
+    """Write the bytes of a file; return its size. On failure the file at `path` is unchanged."""
+    try:
+        with atomic_write(path) as aside:
+            aside.write_bytes(data)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from error
+    return len(data)
 
 
 def copied(reader: Reader, number: int) -> StoredChunk:

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_rows, project_occupancy
+from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, project_occupancy
 from kpc.format.common.errors import BudgetError, FormatError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.container import Codec, Entry, Reader
@@ -51,7 +51,7 @@ from kpc.format.container.segments import (
     side_info_of,
 )
 from kpc.format.container.sources import AnySource, open_source
-from kpc.format.core.decoding import decode_segment
+from kpc.format.core.decoding import decode_segment, implied_rows
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.motion import QuantisedMotion
@@ -212,7 +212,7 @@ class SceneReader(Reader):
         body, implied = self.context_coded(number), None
         if needs_occupancy(body):
             rows = range(entry.row_start, entry.row_start + entry.row_count)
-            implied = needed_rows(self._projection(ALL_PLANES[entry.plane]), plane.rows, plane.columns, rows)
+            implied = implied_rows(self._projection(ALL_PLANES[entry.plane]), plane.rows, plane.columns, rows)
         return self._parsed(
             lambda body: (
                 *decode_segment(entry.codec, body, *shape, implied, limit),

@@ -1,17 +1,18 @@
-"""Plane segments under the context codecs PREDICTIVE and TRANSFORM: which codec a segment takes, and with what side
-information.
-"""
+"""Plane segments: how many rows they have, and the side information of those under PREDICTIVE and TRANSFORM."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
-from kpc.format.coding.predictive import PredictionWeights, decode_symbols, encode_symbols, needs_occupancy, weights_in
-from kpc.format.coding.transform import decode_blocks
-from kpc.format.common.errors import FormatError
 from kpc.format.container.container import Codec
+
+# Map modes (spec/kpc-format.md, "Texel map"): all texels are coded; the map is stored; it follows from the occupancy.
+MAP_ALL, MAP_CODED, MAP_IMPLIED = range(3)
+# Flags of a segment under PREDICTIVE: the map mode in the lowest bits, above it the quantiser.
+MODE_BITS = 2
+SCALAR, TRELLIS, DEPENDENT = range(3)
+WEIGHT_COUNT = 9  # weights of a set, each in 1/64
 
 # Rows of a segment of a time plane, at least, unless the plane has fewer. Each segment starts without neighbours and
 # with new models: files of 16-row segments are 2 % (room) and 3 % (soldier) larger (docs/design/entropy-coding.md).
@@ -26,6 +27,20 @@ def rows_per_segment(rows: int, over_time: bool) -> int:
         return rows
     count = max(1, rows // SEGMENT_ROWS)
     return -(-rows // (count * ROW_MULTIPLE)) * ROW_MULTIPLE
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionWeights:
+    """Weights that the symbols of a DEPENDENT plane were chosen with; with others they take far more bits.
+
+    Attributes:
+        weights: (C, WEIGHT_COUNT) int8, in 1/64; C is one of SET_COUNTS.
+    """
+
+    weights: np.ndarray
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, PredictionWeights) and np.array_equal(self.weights, other.weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,78 +76,16 @@ def merge_side_info(segments: Mapping[int, SegmentSideInfo | None]) -> PlaneSide
     return known[0] if known and all(info == known[0] for info in known) else None
 
 
-def encode_segment(
-    symbols: np.ndarray,
-    coded: np.ndarray,
-    side_info: SegmentSideInfo | None = None,
-    implied: np.ndarray | None = None,
-) -> bytes:
-    """Encode a segment under the codec that `choose_codec` returns."""
-    return choose_codec(symbols, coded, side_info, implied)[1]()
-
-
-def choose_codec(
-    symbols: np.ndarray, coded: np.ndarray, side_info: SegmentSideInfo | None, implied: np.ndarray | None
-) -> tuple[Codec, Callable[[], bytes]]:
-    """Return the codec of a segment and a function that encodes it: TRANSFORM if its side information is of these
-    symbols.
-
-    Args:
-        symbols: (H, W, M) int8, 0 where not coded.
-        coded: (H, W) bool.
-        implied: (H, W) bool, the map that the occupancy implies; None where it is not known.
-    """
-    if isinstance(side_info, bytes):
-        if _decodes_to(side_info, symbols, coded, implied):
-            return Codec.TRANSFORM, partial(bytes, side_info)
-        side_info = None
-    return Codec.PREDICTIVE, partial(encode_symbols, symbols, coded, side_info, implied)
-
-
-def _decodes_to(body: bytes, symbols: np.ndarray, coded: np.ndarray, implied: np.ndarray | None) -> bool:
-    """Return whether blocks decode to just these symbols."""
-    try:
-        rows, columns, channels = symbols.shape
-        found, where = decode_blocks(body, rows, columns, channels, implied)
-    except FormatError:  # the occupancy has changed since they were encoded
-        return False
-    return np.array_equal(found, symbols) and np.array_equal(where, coded)
-
-
-def decode_segment(
-    codec: int, body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Decode a segment under PREDICTIVE or TRANSFORM.
-
-    Args:
-        implied: (rows, columns) bool, the map that the occupancy implies; needed where the body `needs_occupancy`.
-
-    Returns:
-        (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels.
-
-    Raises:
-        FormatError: the body is cut off, too long or damaged.
-    """
-    decode = decode_blocks if codec == Codec.TRANSFORM else decode_symbols
-    return decode(body, rows, columns, channels, implied)
-
-
 def side_info_of(codec: int, body: bytes) -> SegmentSideInfo | None:
-    """Return the side information in what `decode_segment` decodes."""
-    return bytes(body) if codec == Codec.TRANSFORM else weights_in(body)
+    """Return the side information of a segment that can be decoded, from what is stored."""
+    if codec == Codec.TRANSFORM:
+        return bytes(body)
+    if body[1] >> MODE_BITS != DEPENDENT:
+        return None
+    sets = body[0]
+    return PredictionWeights(np.frombuffer(body, np.int8, WEIGHT_COUNT * sets, 2).reshape(sets, WEIGHT_COUNT))
 
 
-__all__ = [
-    "SEGMENT_ROWS",
-    "PlaneSideInfo",
-    "SegmentSideInfo",
-    "TransformSegments",
-    "choose_codec",
-    "decode_segment",
-    "encode_segment",
-    "merge_side_info",
-    "needs_occupancy",
-    "rows_per_segment",
-    "side_info_at",
-    "side_info_of",
-]
+def needs_occupancy(body: bytes) -> bool:
+    """Return whether the map of a segment under PREDICTIVE or TRANSFORM follows from the occupancy."""
+    return len(body) > 1 and body[1] & (1 << MODE_BITS) - 1 == MAP_IMPLIED

@@ -41,7 +41,10 @@ static Status decode_bits(Decoder *d, u32 S, u32 Z, u32 Y, u32 X, u8 *raw) {
                     s > 0 && z > 0 ? past - layer : outside,
                 };
                 if (!decode_row(d, now, rows, X)) return WORDS_DO_NOT_END;
-                for (u32 x = 0; x < X; x++, bit++) raw[bit >> 3] |= (u8)(now[x] << (bit & 7));
+                for (u32 x = 0; x < X; x++, bit++) {
+                    u8 before = bit & 7 ? raw[bit >> 3] : 0;
+                    raw[bit >> 3] = (u8)(before | now[x] << (bit & 7));
+                }
             }
     return check_end(d);
 }
@@ -58,7 +61,6 @@ EXPORT(kpc_occupancy) Status kpc_occupancy(const u8 *body, u32 length, u8 *raw, 
     Status status = open_coded_data(&d, body + 8, length - 8);
     if (status != OK) return status;
     copy(raw, body, 8);
-    fill(raw + 8, 0, raw_length - 8);
     status = decode_bits(&d, S, Z, Y, X, raw + 8);
     release(marked);
     return status;

@@ -7,9 +7,10 @@ eight. For a parabola that is exact between its pixels; for an edge it is not, b
 
 import numpy as np
 
-from kpc.format.coding.rans import compiled
+from kpc.jit import compiled
+from kpc.player.cpu.interpolation import interpolate_pixel
 from kpc.player.cpu.lanes import FAST, F
-from kpc.player.cpu.picture import BLOCK, Picture, interpolate_pixel
+from kpc.player.cpu.picture import BLOCK, Picture
 from kpc.player.cpu.threads import share_out
 
 # Pixels of the finer picture to one of the coarser, along each axis.

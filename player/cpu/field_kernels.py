@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kpc.format.coding.rans import compiled
+from kpc.jit import compiled
 from kpc.player.cpu.lanes import (
     CORNERS,
     FAST,

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kpc.format.coding.rans import compiled
+from kpc.jit import compiled
 from kpc.player.cpu.simd import WIDE
 
 # Rays side by side. With 256 a picture takes 1.05 of the time, with 128 1.1; what they hold fits the two nearest

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kpc.format.coding.rans import compiled
 from kpc.format.scene import space
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION
+from kpc.jit import compiled
 from kpc.player.cpu.field_kernels import displace, sample_corner_grid, sample_planes
 from kpc.player.cpu.lanes import (
     BLUE,

@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kpc.format.coding.rans import compiled
 from kpc.format.scene.cameras import Camera
+from kpc.jit import compiled
+from kpc.player.cpu.interpolation import interpolate_pixel
 from kpc.player.cpu.lanes import FAST, F, I, kernel_part
-from kpc.player.cpu.picture import BLOCK, Picture, interpolate_pixel
+from kpc.player.cpu.picture import BLOCK, Picture
 from kpc.player.cpu.threads import share_out
 
 # Between the opacities of a block's corners, from which on it counts as an edge against the background.

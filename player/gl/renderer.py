@@ -10,6 +10,8 @@ serve, a hybrid decoder or
 
 import math
 import time as clock
+from functools import cache
+from typing import TYPE_CHECKING
 
 import moderngl
 import numpy as np
@@ -18,7 +20,6 @@ from kpc.format.common.errors import DisplayError
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.atlas import Layout, TimeRows
-from kpc.player.cpu.cpu_renderer import ProcessorRenderer
 from kpc.player.cpu.reference import Part, Rendering, appearance_code
 from kpc.player.footprint import texels_per_pixel
 from kpc.player.gl.folding import UPSAMPLING
@@ -28,6 +29,9 @@ from kpc.player.gl.shader_renderer import ShaderRenderer
 from kpc.player.gl.targets import Target
 from kpc.player.gl.textures import SceneTextures
 from kpc.player.quality import LEVELS, Quality
+
+if TYPE_CHECKING:
+    from kpc.player.cpu.cpu_renderer import ProcessorRenderer
 
 # Pictures on the card that are kept for the next use of their size.
 TARGETS_KEPT = 8
@@ -52,6 +56,18 @@ def tries_compute(ctx: moderngl.Context) -> bool:
     return ctx.version_code >= COMPUTE_VERSION and not is_software(ctx)
 
 
+@cache
+def processor_renderer() -> "type[ProcessorRenderer] | None":
+    """Return the processor's renderer; None without numba, which the extras `cpu` and `encoder` bring."""
+    try:
+        from kpc.player.cpu.cpu_renderer import ProcessorRenderer
+    except ModuleNotFoundError as error:
+        if error.name not in ("numba", "llvmlite"):
+            raise
+        return None
+    return ProcessorRenderer
+
+
 class Renderer:
     """A scene that is ready to be drawn.
 
@@ -61,7 +77,8 @@ class Renderer:
         quality: how finely to draw.
         compute: whether compute shaders draw, else fragment shaders; None: graphics cards that have both try them once
             and keep the faster.
-        processor: whether the processor's own code draws folded levels; None: where a software driver would.
+        processor: whether the processor's own code draws folded levels, if numba is there; None: where a software
+            driver would.
 
     Attributes:
         quality: may be set at any time.
@@ -88,8 +105,9 @@ class Renderer:
         self._shaders = ShaderRenderer(self._textures, self._programs)
         self._presentation = Presentation(self._textures, self._programs)
         self._processor: ProcessorRenderer | None = None
-        if (is_software(ctx) if processor is None else processor) and ProcessorRenderer.serves(scene):
-            self._processor = ProcessorRenderer(scene, self.layout, self._textures.read_atlas)
+        kind = processor_renderer() if (is_software(ctx) if processor is None else processor) else None
+        if kind is not None and kind.serves(scene):
+            self._processor = kind(scene, self.layout, self._textures.read_atlas)
             if quality.folded:
                 self._processor.warm_up(quality)
         self._targets: dict[tuple[Part, tuple[int, int]], Target] = {}
@@ -115,7 +133,7 @@ class Renderer:
 
     # --- who draws, and what that takes
 
-    def _drawing_processor(self) -> ProcessorRenderer | None:
+    def _drawing_processor(self) -> "ProcessorRenderer | None":
         """Return the processor's renderer if it draws at this quality."""
         return self._processor if self.quality.folded else None
 
@@ -163,7 +181,9 @@ class Renderer:
             texels += 2 * finer.size[0] * finer.size[1] + (1 + UPSAMPLING) * rows
         motion = 0 if scene.motion is None else 16 * int(np.prod(scene.motion.shape[1:4]))
         culling = 4 * int(np.prod([side + 1 for side in scene.occupancy.shape[1:]]))
-        return 16 * texels + ProcessorRenderer.bytes_for(scene) + scene.occupancy.nbytes + motion + culling
+        kind = processor_renderer()
+        processor = 0 if kind is None else kind.bytes_for(scene)
+        return 16 * texels + processor + scene.occupancy.nbytes + motion + culling
 
     # --- what changes in the scene
 

@@ -12,6 +12,7 @@ import torch
 import datasets as make
 from gradients import random_rays, translucent_scene
 from kpc.encoder.cli import encode_scene
+from kpc.encoder.coding.scene_writer import encode
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ssim
 from kpc.encoder.evaluation.ground_truth import ground_truth
@@ -28,7 +29,7 @@ from kpc.encoder.training.train import Trainer
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import UsageError
 from kpc.format.common.fidelity import psnr
-from kpc.format.container.scene_io import encode, read
+from kpc.format.container.scene_io import read
 from kpc.player.cpu import reference
 from scenes import tiny_scene, with_appearances, with_hybrid_decoder
 

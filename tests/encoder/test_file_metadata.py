@@ -10,6 +10,7 @@ import datasets as make
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.metadata import describe, hash_dataset, reserve_figures, with_figures, with_view
 from kpc.encoder.cli.options import Options, parse
+from kpc.encoder.coding import scene_writer
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.coding.quantise import quantise_scene
@@ -97,7 +98,7 @@ def test_the_view_is_that_which_the_reference_renderer_finds(variant: str) -> No
 
 def test_coding_a_file_again_keeps_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = replace(scene_of_five(), metadata=Metadata(FULL))
-    scene_io.write(quantise_scene(scene, [dict.fromkeys(scene.scales[0], 0.05)]), tmp_path / "in.kpc")
+    scene_writer.write(quantise_scene(scene, [dict.fromkeys(scene.scales[0], 0.05)]), tmp_path / "in.kpc")
     options = ["--quality", "40", "--tune-steps", "0", "--title", "New", "--view-limits", "reach=0.5"]
     assert kpenc.main([str(tmp_path / "in.kpc"), "-o", str(tmp_path / "out.kpc"), *options]) == 0
     found = scene_io.read(tmp_path / "out.kpc").metadata

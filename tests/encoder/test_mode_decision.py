@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from test_trellis import waves
 
+from kpc.encoder.coding import scene_writer
+from kpc.encoder.coding.transform import DEFAULT_OFFSET, OFFSET_COUNT
 from kpc.encoder.rdo import dct_rdo, mode_decision
 from kpc.encoder.rdo.distortion import NO_CORRELATION, total_distortion
 from kpc.encoder.rdo.mode_decision import quantise_by_cost, requested_step
 from kpc.encoder.rdo.trellis import LOW_RATE_BITS, trellis_quantise
-from kpc.format.coding.predictive import PredictionWeights
 from kpc.format.coding.quantise import QuantisedPlane, quantise_plane
-from kpc.format.coding.transform import DEFAULT_OFFSET, OFFSET_COUNT
 from kpc.format.container import scene_io
-from kpc.format.container.segments import TransformSegments
+from kpc.format.container.segments import PredictionWeights, TransformSegments
 from scenes import tiny_scene
 
 
@@ -155,9 +155,9 @@ def test_files_keep_symbols_and_requested_steps() -> None:
     quantised = quantise_by_cost(scene, steps)
     kinds = {type(plane.side_info) for scale in quantised.scales for plane in scale.values()}
     assert TransformSegments in kinds
-    data = scene_io.encode(quantised)
+    data = scene_writer.encode(quantised)
     back = scene_io.read(data)
-    assert scene_io.encode(back) == data
+    assert scene_writer.encode(back) == data
     for ours, theirs in zip(back.scales, quantised.scales, strict=True):
         for name in ours:
             np.testing.assert_array_equal(ours[name].symbols, theirs[name].symbols)
@@ -168,9 +168,9 @@ def test_files_keep_symbols_and_requested_steps() -> None:
         back,
         scales=tuple({name: replace(plane, side_info=None) for name, plane in scale.items()} for scale in back.scales),
     )
-    assert len(scene_io.encode(forgotten)) > len(data)
+    assert len(scene_writer.encode(forgotten)) > len(data)
     assert (
-        scene_io.read(scene_io.encode(forgotten)).scales[0]["xy"].symbols.tobytes()
+        scene_io.read(scene_writer.encode(forgotten)).scales[0]["xy"].symbols.tobytes()
         == back.scales[0]["xy"].symbols.tobytes()
     )
     without = quantise_by_cost(scene, steps, block_sides=())

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from codec_inputs import swaying
+from kpc.encoder.coding.motion_codec import encode_motion
 from kpc.encoder.evaluation.validation_rays import Fidelity
 from kpc.encoder.rdo.motion_rdo import MAX_MULTIPLE, SHARE, coarsen_motion, quantise_motion
-from kpc.format.coding.motion_codec import encode_motion
 from kpc.format.scene.motion import FINEST_STEP
 from kpc.format.scene.scene import Scene
 from scenes import tiny_scene, with_motion

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from codec_inputs import rolling
+from kpc.encoder.coding.occupancy_codec import CONTEXTS, NEIGHBOURS, encode_occupancy
+from kpc.encoder.coding.rans import code_bit_adaptive, encode_trace, new_models
 from kpc.encoder.evaluation.validation_rays import Fidelity, ValidationRays
 from kpc.encoder.rdo import occupancy_rdo
 from kpc.encoder.rdo.occupancy_rdo import CONTRAST, count_contexts, flip_cells, optimise_occupancy, removal_errors
-from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS, encode_occupancy
-from kpc.format.coding.rans import code_bit_adaptive, encode_trace, new_models
 from kpc.format.scene.grid import dilate
 from scenes import tiny_scene
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kpc.encoder.coding import scene_writer
 from kpc.encoder.evaluation.evaluate import SceneRenderer, pad_channels
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.rdo.codec_model import Model, code, model_from_file
@@ -153,7 +154,7 @@ def test_pruning_and_quantisation_together_stay_within_the_limit() -> None:
         np.testing.assert_array_equal(found[0, 0], 8.0 * kept[:, None] + kept)
     # So small a scene's loss leaps by a quarter from one step to the next: how near it comes depends on the
     # processor's rounding.
-    assert (SPARE + 0.15) / 2 < coded.loss_db <= 0.15 and coded.size_bytes == len(scene_io.encode(coded.scene))
+    assert (SPARE + 0.15) / 2 < coded.loss_db <= 0.15 and coded.size_bytes == len(scene_writer.encode(coded.scene))
     fidelity = Fidelity(scene, rays)
     assert fidelity(scene) - fidelity(coded.scene.dequantise()) == pytest.approx(coded.loss_db, abs=1e-3)
 
@@ -200,7 +201,7 @@ def test_view_independent_colour_takes_few_bytes() -> None:
     steps = [dict.fromkeys(scale, 0.05) for scale in scene.scales]
     stored = []
     for each in (scene, plain):
-        reader = scene_io.SceneReader(scene_io.encode(quantise_scene(each, steps)))
+        reader = scene_io.SceneReader(scene_writer.encode(quantise_scene(each, steps)))
         (deco,) = [entry for entry in reader.index if entry.kind == "DECO"]
         stored.append((deco.raw_length, deco.stored_length))
     assert stored[1][0] == 8 + 2 * (7 * 16 + 10) < 0.15 * stored[0][0] and stored[1][1] <= stored[1][0]
@@ -250,7 +251,7 @@ def test_all_renderers_agree_on_unequal_numbers_of_channels() -> None:
     even = pad_channels(scene)
     np.testing.assert_allclose(reference.render(even, camera, 0.5).rgb.reshape(-1, 3), theirs, atol=1e-5)
     quantised = quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales])
-    again = scene_io.read(scene_io.encode(quantised)).dequantise()
+    again = scene_io.read(scene_writer.encode(quantised)).dequantise()
     assert [scale["xy"].shape[2] for scale in again.scales] == [3, 8] and again.parameter_count == scene.parameter_count
 
 
@@ -272,6 +273,6 @@ def test_a_pruned_file_is_coded_with_its_own_steps_or_coarser_ones(
     own = quantise_scene(scene, [dict.fromkeys(planes, 0.004) for planes in scene.scales])
     coded = code(model_from_file(own), Trade(quality=quality), 0.25, 0)
     assert coded.pruned is not None and coded.pruned.removed_any
-    assert coded.size_bytes < len(scene_io.encode(own))
+    assert coded.size_bytes < len(scene_writer.encode(own))
     if quality < 50:
         assert 0 <= coded.agreement_db - (20 + quality / 3) < 0.5

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from kpc.encoder.coding import scene_writer
 from kpc.encoder.evaluation.validation_rays import Fidelity
 from kpc.encoder.rdo import mode_decision
 from kpc.encoder.rdo.rate_control import (
@@ -27,7 +28,6 @@ from kpc.encoder.rdo.rate_control import (
 )
 from kpc.encoder.rdo.rate_search import MAX_TUNINGS
 from kpc.format.coding.quantise import QuantisedScene, quantise_scene, round_decoder
-from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 from scenes import tiny_scene
 
@@ -118,7 +118,7 @@ def test_the_size_stays_just_below_its_limit(share: float) -> None:
     largest, smallest = (coded(max_loss_db=most).size_bytes for most in (1e-9, 1e9))
     target = int(smallest + share * (largest - smallest))
     found = coded(target_bytes=target)
-    assert found.size_bytes == len(scene_io.encode(found.quantised))
+    assert found.size_bytes == len(scene_writer.encode(found.quantised))
     assert 0.94 * target < found.size_bytes <= target
 
 
@@ -142,7 +142,7 @@ def test_a_larger_lam_gives_a_smaller_file() -> None:
 
 def test_an_unreachable_loss_gives_the_finest_steps() -> None:
     finest = quantise_by_cost(SCENE, scaled(EQUAL, 2.0**FINEST))
-    assert scene_io.encode(coded(max_loss_db=-1.0).quantised) == scene_io.encode(finest)
+    assert scene_writer.encode(coded(max_loss_db=-1.0).quantised) == scene_writer.encode(finest)
 
 
 def test_nan_does_not_meet_a_target() -> None:
@@ -159,7 +159,7 @@ def test_nan_does_not_meet_a_target() -> None:
 def test_a_file_is_never_coded_with_finer_steps() -> None:
     whole = quantise_scene(SCENE, scaled(EQUAL, 0.01))
     own = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in whole.scales]
-    size = len(scene_io.encode(whole))
+    size = len(scene_writer.encode(whole))
     for trade in (Trade(quality=100), Trade(target_bytes=size), Trade(max_loss_db=1e-9)):
         judged = controller(whole.dequantise(), own, ALIKE, measure, measure(whole.dequantise()).psnr, whole).meet(
             trade

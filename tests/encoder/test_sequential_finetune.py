@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from kpc.encoder.coding import scene_writer
 from kpc.encoder.evaluation.evaluate import pad_channels, unpad_decoder
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.rdo import sequential_finetune
@@ -67,7 +68,7 @@ def test_fine_tuning_reduces_the_error_of_pictures(make: Callable[[], Scene]) ->
     scene = make()
     plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 60)
     assert error(scene, better) < 0.96 * error(scene, plain)
-    assert scene_io.read(scene_io.encode(better)).parameter_count == plain.parameter_count
+    assert scene_io.read(scene_writer.encode(better)).parameter_count == plain.parameter_count
 
 
 def test_the_first_group_is_not_fine_tuned_and_only_planes_and_decoder_change() -> None:
@@ -122,7 +123,7 @@ def test_progress_is_shown_on_request(monkeypatch: pytest.MonkeyPatch, capsys: p
 
 def test_results_are_reproducible() -> None:
     scene = tiny_scene()
-    assert scene_io.encode(quantise_sequentially(scene, scene, choose, 5)) == scene_io.encode(
+    assert scene_writer.encode(quantise_sequentially(scene, scene, choose, 5)) == scene_writer.encode(
         quantise_sequentially(scene, scene, choose, 5)
     )
 
@@ -143,4 +144,4 @@ def test_unequal_scales_appearances_and_the_hybrid_decoder() -> None:
         plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 40)
         assert error(scene, better) < error(scene, plain)
         assert [a.code.tolist() for a in better.appearances] == [a.code.tolist() for a in plain.appearances]
-        scene_io.read(scene_io.encode(better))
+        scene_io.read(scene_writer.encode(better))

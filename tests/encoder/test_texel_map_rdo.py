@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from kpc.encoder.coding.rans import SCALE, code_bit_adaptive, new_models
+from kpc.encoder.coding.texel_map import MAP_CONTEXTS, code_map
 from kpc.encoder.rdo.texel_map_rdo import IDENTITY_TOLERANCE, MAP_LAM, choose_coded_texels, map_context
-from kpc.format.coding.rans import SCALE, code_bit_adaptive, new_models
-from kpc.format.coding.texel_map import MAP_CONTEXTS, code_map
 
 
 def bits_of(coded):

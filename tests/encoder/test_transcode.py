@@ -14,6 +14,7 @@ import torch
 import datasets as make
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.work_folder import CHECKPOINT
+from kpc.encoder.coding import scene_writer
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import ASSUMED_MSE, ValidationRays, orbit_cameras
 from kpc.encoder.field.config import PRESETS, TrainConfig
@@ -114,7 +115,7 @@ def test_every_kind_of_scene_survives_a_checkpoint(tmp_path: Path, kind: str) ->
     scene = (VARIANTS | others)[kind](tiny_scene(2))
     steps = [dict.fromkeys(scale, 0.01) for scale in scene.scales]
     back = codec_model.load(saved(tmp_path / "m.kpck", scene))
-    assert scene_io.encode(quantise_scene(back.scene, steps)) == scene_io.encode(quantise_scene(scene, steps))
+    assert scene_writer.encode(quantise_scene(back.scene, steps)) == scene_writer.encode(quantise_scene(scene, steps))
     assert back.coded is None and back.validation.measure(scene)(back.scene).mse == 0
 
 
@@ -202,7 +203,7 @@ def test_a_checkpoint_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest
 @pytest.fixture
 def scene_file(tmp_path: Path) -> Path:
     scene = tiny_scene(3)
-    scene_io.write(
+    scene_writer.write(
         quantise_scene(scene, [dict.fromkeys(scale, 0.002) for scale in scene.scales]), tmp_path / "scene.kpc"
     )
     return tmp_path / "scene.kpc"
@@ -321,8 +322,8 @@ def test_planes_of_one_texel_are_coded_again(axis: str) -> None:
 def test_files_of_all_kinds_are_coded_again(name: str) -> None:
     source = codec_model.model_from_file(scene_io.read(VECTORS / f"{name}.kpc"))
     coded = codec_model.code(source, Trade(), TrainConfig().prune_share, 1)
-    assert coded.loss_db <= 0.15 and len(scene_io.encode(scene_io.read(coded.data))) == coded.size_bytes
-    assert coded.size_bytes <= len(scene_io.encode(source.coded))  # type: ignore[arg-type]
+    assert coded.loss_db <= 0.15 and len(scene_writer.encode(scene_io.read(coded.data))) == coded.size_bytes
+    assert coded.size_bytes <= len(scene_writer.encode(source.coded))  # type: ignore[arg-type]
 
 
 # --- validation rays

@@ -5,22 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kpc.encoder.coding import scene_writer
+from kpc.encoder.coding.predictive import ACTIVITIES, encode_symbols, follows_trellis, trellis_transition
 from kpc.encoder.rdo import distortion, trellis
 from kpc.encoder.rdo.distortion import NO_CORRELATION
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
 from kpc.encoder.rdo.trellis import MAGNITUDE_BINS, STATES
-from kpc.format.coding.predictive import (
-    ACTIVITIES,
-    TRELLIS,
-    WEIGHT_COUNT,
-    encode_symbols,
-    follows_trellis,
-    trellis_transition,
-    weights_in,
-)
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
 from kpc.format.container import scene_io
-from kpc.format.container.segments import rows_per_segment
+from kpc.format.container.container import Codec
+from kpc.format.container.segments import TRELLIS, WEIGHT_COUNT, rows_per_segment, side_info_of
 from kpc.format.scene.scene import TIME_PLANES, Scene
 from scenes import tiny_scene
 
@@ -201,7 +195,9 @@ def test_weights_are_relative_to_the_channel() -> None:
         {name: np.full(p.shape, 2.0 ** -np.arange(p.shape[2]), np.float32) for name, p in scale.items()}
         for scale in scene.scales
     ]
-    assert scene_io.encode(trellis_quantised(scene, 0.05, faint)) == scene_io.encode(trellis_quantised(scene, 0.05))
+    assert scene_writer.encode(trellis_quantised(scene, 0.05, faint)) == scene_writer.encode(
+        trellis_quantised(scene, 0.05)
+    )
 
 
 @pytest.mark.parametrize("step", [0.3, 1.0, 3.0])
@@ -288,7 +284,7 @@ def test_low_rates_use_dependent_mode(identity: bool) -> None:
         segments = range(0, len(values), rows_per_segment(len(values), identity))
         parts = [slice(start, start + segments.step) for start in segments]
         bodies = [encode_symbols(plane.symbols[rows], plane.coded[rows], plane.side_info) for rows in parts]
-        assert all(weights_in(body) == plane.side_info for body in bodies)
+        assert all(side_info_of(Codec.PREDICTIVE, body) == plane.side_info for body in bodies)
         errors = plane.dequantise() - values
         return float(
             (errors / 2.0).ravel() @ (errors / 2.0).ravel() * interpolated_error(errors) / np.mean(np.square(errors))
@@ -303,16 +299,16 @@ def test_low_rates_use_dependent_mode(identity: bool) -> None:
 
 def test_files_keep_prediction_weights() -> None:
     scene = trellis_quantised(noisy(), 0.05)
-    data = scene_io.encode(scene)
+    data = scene_writer.encode(scene)
     back = scene_io.read(data)
-    assert scene_io.encode(back) == data
+    assert scene_writer.encode(back) == data
     for ours, theirs in zip(back.scales, scene.scales, strict=True):
         assert all(ours[name].side_info == theirs[name].side_info for name in ours)
     forgotten = replace(
         back,
         scales=tuple({name: replace(plane, side_info=None) for name, plane in scale.items()} for scale in back.scales),
     )
-    assert len(scene_io.encode(forgotten)) > len(data)
+    assert len(scene_writer.encode(forgotten)) > len(data)
 
 
 def test_symbols_stay_within_eight_bits() -> None:

@@ -66,7 +66,7 @@ def test_nothing_is_printed_into_files(clock: list[float], monkeypatch: pytest.M
 
 
 def test_numba_reports_its_compilations(clock: list[float]) -> None:
-    import kpc.format.common.jit  # noqa: F401
+    import kpc.jit  # noqa: F401
 
     kinds, on_start = [], MONITOR.on_start
     MONITOR.on_start = lambda event: (kinds.append(event.kind), on_start(event))

@@ -11,7 +11,7 @@ import pytest
 import wasmtime
 
 from codec_inputs import random_blocks, textured
-from kpc.format.coding import predictive, rans, texel_map, transform, weights
+from kpc.encoder.coding import predictive, rans, texel_map, transform, weights
 from kpc.format.coding.quantise import dequantise_symbols
 from kpc.format.common.errors import BudgetError, FormatError
 from kpc.format.container import scene_layout

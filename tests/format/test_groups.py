@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 import kpc
+from kpc.encoder.coding import scene_writer
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import BudgetError, FormatError, UsageError
 from kpc.format.common.images import read_image
@@ -25,7 +26,7 @@ from scenes import tiny_scene, with_appearances
 
 
 def coded(scene: Scene) -> bytes:
-    return scene_io.encode(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]))
+    return scene_writer.encode(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]))
 
 
 @pytest.fixture(scope="module")

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import kpc
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, NetworkError, UnreachableError
 from kpc.format.container import http, http_client
 from kpc.format.container.http import FIRST_BYTES, HttpSource
 from kpc.format.container.http_address import is_url
-from kpc.format.container.scene_io import SceneReader, write
+from kpc.format.container.scene_io import SceneReader
 from kpc.format.container.sources import RemoteSource, Source
 from kpc.tools.cli.serve import Handler, Link, serving
 from scenes import tiny_scene

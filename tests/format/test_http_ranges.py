@@ -238,8 +238,8 @@ def test_nodes_with_names_of_their_own_for_a_file_do_not_stop_it(
 
 @pytest.fixture
 def scene(folder: Path) -> Iterator[Path]:
+    from kpc.encoder.coding.scene_writer import write
     from kpc.format.coding.quantise import quantise_scene
-    from kpc.format.container.scene_io import write
     from scenes import tiny_scene
 
     for seed, name in enumerate(("scene", "other")):

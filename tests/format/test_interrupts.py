@@ -56,7 +56,8 @@ def interrupted(folder: Path, command: str) -> subprocess.CompletedProcess[str]:
             """
             import keyboard
             from numba import extending, njit, types
-            from kpc.format.common import cli, jit
+            from kpc import jit
+            from kpc.format.common import cli
             def marker():
                 pass
             @extending.overload(marker)

@@ -12,13 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kpc.encoder.coding.scene_writer import encode
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import FormatError
 from kpc.format.container import groups
 from kpc.format.container.metadata_chunk import pack_metadata, parse_metadata
 from kpc.format.container.metadata_options import add_metadata_options, members_from
 from kpc.format.container.partial import PartialScene
-from kpc.format.container.scene_io import SceneReader, encode, read
+from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.scene.metadata import Metadata, camera_document, camera_from, limits_document, merged
 from kpc.tools.vectors.metadata_vectors import FULL
 from scenes import tiny_scene

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from codec_inputs import rolling
-from kpc.format.coding.occupancy_codec import decode_occupancy, encode_occupancy
+from core_decoders import decode_occupancy
+from kpc.encoder.coding.occupancy_codec import encode_occupancy
 from kpc.format.common.errors import FormatError
 from without_numba import assert_same_without_numba
 
@@ -56,7 +57,8 @@ PLAIN = """
 import hashlib
 import numpy as np
 from codec_inputs import rolling
-from kpc.format.coding.occupancy_codec import decode_occupancy, encode_occupancy
+from core_decoders import decode_occupancy
+from kpc.encoder.coding.occupancy_codec import encode_occupancy
 
 for occupancy in (rolling(3, 8, 9, 10), np.random.default_rng(1).random((2, 5, 1, 7)) < 0.5):
     body = encode_occupancy(occupancy)
@@ -66,7 +68,7 @@ for occupancy in (rolling(3, 8, 9, 10), np.random.default_rng(1).random((2, 5, 1
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    assert_same_without_numba(PLAIN, "kpc.format.coding.occupancy_codec:code_cells")
+    assert_same_without_numba(PLAIN, "kpc.encoder.coding.occupancy_codec:code_cells")
 
 
 # --- damage and hostility

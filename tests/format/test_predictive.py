@@ -11,27 +11,30 @@ from hypothesis import strategies as st
 from numba import njit
 
 from codec_inputs import PLANE_PATTERNS, followed, on_trellis, plane_pattern, textured
-from kpc.format.coding import predictive as module
-from kpc.format.coding.predictive import (
+from core_decoders import decode_symbols
+from kpc.encoder.coding import predictive as module
+from kpc.encoder.coding.predictive import (
     ACTIVITIES,
-    DEPENDENT,
-    SCALAR,
     SET_COUNTS,
-    TRELLIS,
-    WEIGHT_COUNT,
-    PredictionWeights,
     collect_neighbours,
-    decode_symbols,
     encode_symbols,
     encode_with_weights,
     fit_weights,
     follows_trellis,
     trellis_transition,
-    weights_in,
 )
-from kpc.format.coding.raw_planes import encode_raw_segment
-from kpc.format.coding.texel_map import MODE_BITS
+from kpc.encoder.coding.raw_planes import encode_raw_segment
 from kpc.format.common.errors import FormatError
+from kpc.format.container.container import Codec
+from kpc.format.container.segments import (
+    DEPENDENT,
+    MODE_BITS,
+    SCALAR,
+    TRELLIS,
+    WEIGHT_COUNT,
+    PredictionWeights,
+    side_info_of,
+)
 from without_numba import assert_same_without_numba
 
 shapes = st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 5))
@@ -78,7 +81,7 @@ def test_symbols_on_the_trellis_come_back(paint, shape, seed, share):
     symbols = on_trellis(symbols, coded)
     assert follows_trellis(symbols, coded)
     body = encode_symbols(symbols, coded)
-    assert body[1] >> MODE_BITS == TRELLIS and weights_in(body) is None
+    assert body[1] >> MODE_BITS == TRELLIS and side_info_of(Codec.PREDICTIVE, body) is None
     assert_decodes(body, symbols, coded)
 
 
@@ -106,7 +109,9 @@ def test_dependent_symbols_come_back(paint, shape, seed, share, count):
     symbols = followed(symbols, coded, side_info)
     body = encode_symbols(symbols, coded, side_info)
     assert_decodes(body, symbols, coded)
-    assert weights_in(body) == side_info and body == encode_with_weights(side_info.weights, symbols, coded, DEPENDENT)
+    assert side_info_of(Codec.PREDICTIVE, body) == side_info and body == encode_with_weights(
+        side_info.weights, symbols, coded, DEPENDENT
+    )
 
 
 @pytest.mark.parametrize("flat", [0, ACTIVITIES])
@@ -189,8 +194,9 @@ PLAIN = """
 import hashlib
 import numpy as np
 from codec_inputs import followed, on_trellis, plane_pattern, textured
-from kpc.format.coding.predictive import DEPENDENT, SCALAR, TRELLIS, PredictionWeights
-from kpc.format.coding.predictive import decode_symbols, encode_with_weights
+from kpc.encoder.coding.predictive import DEPENDENT, SCALAR, TRELLIS, PredictionWeights
+from core_decoders import decode_symbols
+from kpc.encoder.coding.predictive import encode_with_weights
 
 smooth, coded = textured(14, 12, 3)
 weights = np.random.default_rng(3).integers(-128, 128, (4, 9)).astype(np.int8)
@@ -207,7 +213,7 @@ for symbols, coded, lattice in (
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    assert_same_without_numba(PLAIN, "kpc.format.coding.rans:code_bit_adaptive")
+    assert_same_without_numba(PLAIN, "kpc.encoder.coding.rans:code_bit_adaptive")
 
 
 # --- damage and hostility

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from kpc.format.coding.rans import (
+from kpc.encoder.coding.rans import (
     ADAPTATION_LIMIT,
     EVEN_PROBABILITY,
     LOWEST_STATE,
@@ -11,7 +11,7 @@ from kpc.format.coding.rans import (
     new_models,
     trace_words,
 )
-from kpc.format.common.jit import compiled
+from kpc.jit import compiled
 
 
 def encode_bits(bits: list[int], probabilities: list[int]) -> np.ndarray:

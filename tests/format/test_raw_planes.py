@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpc.format.coding.raw_planes import decode_raw_segment, encode_raw_segment
+from core_decoders import decode_raw_segment
+from kpc.encoder.coding.raw_planes import encode_raw_segment
 from kpc.format.common.errors import FormatError
 
 shapes = st.tuples(st.integers(1, 9), st.integers(1, 9), st.integers(1, 4))

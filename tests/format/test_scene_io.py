@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 import kpc
 from codec_inputs import drifting, rolling, swaying
+from kpc.encoder.coding.scene_writer import encode, scene_chunks, write
 from kpc.format.coding.quantise import QuantisedScene, quantise_scene
 from kpc.format.common.errors import BudgetError, FormatError
 from kpc.format.container.container import HEADER, Chunk, Codec, Reader, pack
-from kpc.format.container.scene_io import SceneReader, encode, read, scene_chunks, write
+from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.container.scene_layout import APPEARANCE_LIMIT, NAME_LIMIT
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import FINEST_STEP, QuantisedMotion

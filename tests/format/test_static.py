@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import needed_texels, quantise_scene
-from kpc.format.container.scene_io import write
 from kpc.format.scene.scene import TIME_PLANES, Scene
 from kpc.format.scene.static import cells_reading, constant_cells, constant_fraction, static_cells, static_fraction
 from kpc.player.cpu import motion_map, reference

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from codec_inputs import random_blocks
-from kpc.format.coding.predictive import WEIGHT_COUNT, PredictionWeights, decode_symbols, encode_symbols
-from kpc.format.coding.transform import (
+from core_decoders import decode_blocks, decode_symbols
+from kpc.encoder.coding.predictive import encode_symbols
+from kpc.encoder.coding.segments import choose_codec, encode_segment
+from kpc.encoder.coding.transform import (
     DEFAULT_OFFSET,
     HEAD,
     LARGEST,
@@ -17,7 +19,6 @@ from kpc.format.coding.transform import (
     UNITS_PER_SYMBOL,
     TransformBlocks,
     dct_basis,
-    decode_blocks,
     decode_levels,
     encode_blocks,
     frequency_weights,
@@ -27,6 +28,7 @@ from kpc.format.coding.transform import (
 from kpc.format.common.errors import FormatError
 from kpc.format.container import segments
 from kpc.format.container.container import Codec
+from kpc.format.container.segments import WEIGHT_COUNT, PredictionWeights
 
 SPEC = Path(__file__).parents[2] / "spec"
 SIZES = ((4, 1, 1), (4, 9, 30), (8, 4, 5), (8, 37, 50), (16, 20, 35), (16, 8, 8))
@@ -151,12 +153,10 @@ def test_an_implied_map_takes_no_bytes() -> None:
     body, longer = encode_blocks(blocks, coded, coded), encode_blocks(blocks, coded)
     assert len(body) < len(longer) - 100
     np.testing.assert_array_equal(decode_blocks(body, 37, 50, 3, coded)[0], decode_blocks(longer, 37, 50, 3)[0])
-    assert segments.encode_segment(*decode_blocks(body, 37, 50, 3, coded), body, coded) == body
+    assert encode_segment(*decode_blocks(body, 37, 50, 3, coded), body, coded) == body
     with pytest.raises(FormatError, match="an occupancy that is not known"):
         decode_blocks(body, 37, 50, 3)
-    other = segments.encode_segment(
-        *decode_blocks(body, 37, 50, 3, coded), body, ~coded
-    )  # such side information is useless
+    other = encode_segment(*decode_blocks(body, 37, 50, 3, coded), body, ~coded)  # such side information is useless
     assert len(other) != len(body) and decode_symbols(other, 37, 50, 3)[1].any()
 
 
@@ -165,7 +165,7 @@ def test_truncated_and_longer_bodies_are_refused() -> None:
     body = encode_blocks(blocks, coded)
     for cut in range(len(body)):
         with pytest.raises(FormatError, match=r"plane segment"):
-            segments.decode_segment(Codec.TRANSFORM, body[:cut], 20, 20, 3)
+            decode_blocks(body[:cut], 20, 20, 3)
     with pytest.raises(FormatError, match="do not end where they should"):
         decode_blocks(body + b"\0\0", 20, 20, 3)
     for at, value in ((0, 5), (0, 0), (2, 0)):
@@ -192,14 +192,12 @@ def test_side_information_is_used_only_for_its_own_symbols() -> None:
     blocks, coded = random_blocks(8, 20, 20, 0.8, 6)
     body = encode_blocks(blocks, coded)
     symbols, _ = decode_blocks(body, 20, 20, 3)
-    assert (
-        segments.encode_segment(symbols, coded, body) == body and segments.side_info_of(Codec.TRANSFORM, body) == body
-    )
+    assert encode_segment(symbols, coded, body) == body and segments.side_info_of(Codec.TRANSFORM, body) == body
     moved = symbols.copy()
     moved[tuple(np.argwhere(coded)[0])] ^= 1
-    other = segments.encode_segment(moved, coded, body)
-    assert segments.choose_codec(moved, coded, body, None)[0] == Codec.PREDICTIVE
-    np.testing.assert_array_equal(segments.decode_segment(Codec.PREDICTIVE, other, 20, 20, 3)[0], moved)
+    other = encode_segment(moved, coded, body)
+    assert choose_codec(moved, coded, body, None)[0] == Codec.PREDICTIVE
+    np.testing.assert_array_equal(decode_symbols(other, 20, 20, 3)[0], moved)
 
 
 def test_side_information_of_segments_is_merged() -> None:

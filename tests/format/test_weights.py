@@ -1,4 +1,4 @@
-"""Weights of decoders under codec 2 (spec, section 7): the same comes back, in fewer bytes than float16 or zstd
+"""Weights of decoders under WEIGHTS: the same comes back, in fewer bytes than float16 or zstd
 takes, and damage is refused.
 """
 
@@ -8,13 +8,15 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kpc.format.coding.quantise import decoder_arrays, round_decoder
-from kpc.format.coding.weights import COARSEST, FINEST, LARGEST, decode_weights, encode_weights
+from core_decoders import decode_weights
+from kpc.encoder.coding.weights import COARSEST, LARGEST, encode_weights
+from kpc.format.coding.quantise import FINEST, decoder_arrays, round_decoder
 from kpc.format.common.errors import FormatError
 from scenes import tiny_scene
 from without_numba import assert_same_without_numba
 
-SHAPES = [(5,), (3, 4), (1,), (2, 3, 7)]
+# Of DECO: density_weight, w1, b1, w2 and b2.
+SHAPES = [(5,), (2, 9), (2,), (3, 5, 2), (3, 5)]
 
 
 def some(seed: int, largest: int = 60, power: int = -5, shapes: list[tuple[int, ...]] = SHAPES) -> list[np.ndarray]:
@@ -44,7 +46,7 @@ def decodes_or_is_refused(body: bytes, shapes: list[tuple[int, ...]] = SHAPES) -
     return True
 
 
-@given(seed=st.integers(0, 2**32 - 1), largest=st.integers(1, LARGEST), power=st.integers(FINEST + 3, 4))
+@given(seed=st.integers(0, 2**32 - 1), largest=st.integers(1, LARGEST), power=st.integers(FINEST + 4, 4))
 @settings(deadline=None)
 def test_weights_come_back(seed: int, largest: int, power: int) -> None:
     arrays = some(seed, largest, power)
@@ -54,14 +56,15 @@ def test_weights_come_back(seed: int, largest: int, power: int) -> None:
 def test_the_ends_of_float16_come_back() -> None:
     least = np.float32(0.5**24)
     arrays = [
-        np.float32([65504, -65504, 32]),
-        least * np.float32([1, -2048, 3]),
-        np.zeros(4, np.float32),
         np.float32([2.0**15]),
+        np.float32([[65504, -65504, 32, 0, 0, 0, 0, 0, 0]]),
+        np.zeros(1, np.float32),
+        least * np.float32([[[1]], [[-2048]], [[3]]]),
+        np.zeros((3, 1), np.float32),
     ]
     body = encoded(arrays)
     assert_decodes(body, arrays)
-    assert np.frombuffer(body[:4], np.int8).tolist() == [5, FINEST, 0, COARSEST]
+    assert np.frombuffer(body[:5], np.int8).tolist() == [COARSEST, 5, 0, FINEST, 0]
 
 
 def test_what_has_too_many_digits_is_left_to_other_codecs() -> None:
@@ -82,7 +85,7 @@ def test_plain_python_codes_the_same() -> None:
         "from test_weights import encoded, some\n"
         "for seed in range(3):\n"
         "    print(encoded(some(seed, 60 * 6 ** seed)).hex())",
-        "kpc.format.coding.weights:code_array",
+        "kpc.encoder.coding.weights:code_array",
     )
 
 
@@ -104,11 +107,12 @@ def test_any_bytes_decode_or_are_refused(body: bytes) -> None:
 
 
 def test_what_is_no_number_of_float16_is_refused() -> None:
-    body = encoded([np.float32([2047, 1])])
+    shapes = [(1,), (1, 9), (1,), (3, 1, 1), (3, 1)]
+    body = encoded([np.full(shape, 2047 if shape == (1,) else 1, np.float32) for shape in shapes])
     for power, message in (
         (FINEST - 1, "power of two"),
         (COARSEST + 1, "power of two"),
         (COARSEST, "no number of float16"),
     ):
         with pytest.raises(FormatError, match=message):
-            decode_weights(np.int8([power]).tobytes() + body[1:], [(2,)])
+            decode_weights(np.int8([power]).tobytes() + body[1:], shapes)

@@ -11,9 +11,10 @@ import pytest
 
 import gl
 import kpc
+from kpc.encoder.coding import scene_writer
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import BudgetError
-from kpc.format.container import groups, scene_io
+from kpc.format.container import groups
 from kpc.format.container.container import Reader
 from kpc.format.container.groups import GroupInput, Groups
 from kpc.format.container.sources import open_source
@@ -29,7 +30,7 @@ RATE = 0.2  # fraction of the clip per second
 
 
 def coded(scene: Scene) -> bytes:
-    return scene_io.encode(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]))
+    return scene_writer.encode(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]))
 
 
 @pytest.fixture(scope="module")

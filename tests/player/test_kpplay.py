@@ -11,10 +11,10 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.images import read_image
 from kpc.format.container.container import Reader
-from kpc.format.container.scene_io import write
 from kpc.tools.cli.serve import Handler, serving
 from scenes import tiny_scene, with_appearances
 from x_server import x_server

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 
+from kpc.encoder.coding.scene_writer import encode
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.partial import PartialScene
-from kpc.format.container.scene_io import SceneReader, encode
+from kpc.format.container.scene_io import SceneReader
 from kpc.player.app import time_plane_pictures
 from kpc.player.app.time_plane_pictures import moving_part, time_plane_picture, time_planes
 from scenes import tiny_scene

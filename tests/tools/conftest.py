@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
-from kpc.format.container.scene_io import write
 from kpc.tools.cli import kprender
 from scenes import tiny_scene
 

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.images import read_image
-from kpc.format.container.scene_io import read, write
+from kpc.format.container.scene_io import read
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from datasets import write_n3dv
+from kpc.encoder.coding import scene_writer
 from kpc.format.coding.quantise import quantise_scene
-from kpc.format.container import scene_io
 from kpc.tools.bench import codec_bench, kpbench, plot, results, tables
 from kpc.tools.bench.baselines import Float16, Planes, Uint8, Video
 from kpc.tools.bench.codec_bench import headline
@@ -82,7 +82,7 @@ def test_sizes_at_equal_loss_beside_the_smallest_baseline() -> None:
 @pytest.fixture
 def scene_file(tmp_path: Path) -> Path:
     scene = tiny_scene(3, channels=4)
-    scene_io.write(
+    scene_writer.write(
         quantise_scene(scene, [dict.fromkeys(scale, 0.002) for scale in scene.scales]), tmp_path / "scene.kpc"
     )
     return tmp_path / "scene.kpc"

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import UsageError
 from kpc.format.container import groups
 from kpc.format.container.container import Codec, Reader
-from kpc.format.container.scene_io import SceneReader, read, write
+from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import TIME_PLANES
 from kpc.player.cpu import reference

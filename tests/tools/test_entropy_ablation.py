@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from codec_inputs import followed, random_blocks, textured
-from kpc.format.coding import predictive, transform
-from kpc.format.coding.predictive import SET_COUNTS, PredictionWeights, encode_symbols
+from core_decoders import decode_blocks
+from kpc.encoder.coding import predictive, transform
+from kpc.encoder.coding.predictive import SET_COUNTS, encode_symbols
+from kpc.encoder.coding.scene_writer import write
+from kpc.encoder.coding.segments import encode_segment
 from kpc.format.coding.quantise import quantise_scene
-from kpc.format.container.scene_io import write
-from kpc.format.container.segments import encode_segment
+from kpc.format.container.segments import PredictionWeights
 from kpc.tools.bench import entropy_ablation, kpbench, tables
 from kpc.tools.bench.entropy_ablation import (
     RECORDED,
@@ -31,7 +33,7 @@ def transform_segment(rows: int = 60, columns: int = 92, share: float = 0.7, imp
     blocks, coded = random_blocks(8, rows, columns, share, seed=3)
     occupied = coded if implied else None
     body = transform.encode_blocks(blocks, coded, occupied)
-    symbols, _ = transform.decode_blocks(body, rows, columns, 3, occupied)
+    symbols, _ = decode_blocks(body, rows, columns, 3, occupied)
     return Segment(symbols, coded, coded if implied else ~coded, body, body)
 
 

@@ -11,11 +11,11 @@ import pytest
 import gl
 import kpc
 from datasets import write_n3dv
+from kpc.encoder.coding.scene_writer import write
 from kpc.encoder.evaluation import profile
 from kpc.encoder.evaluation.ablations import ABLATIONS, effective_ablations
 from kpc.encoder.field.config import PRESETS
 from kpc.format.coding.quantise import quantise_scene
-from kpc.format.container.scene_io import write
 from kpc.player.quality import DEFAULT, LEVELS
 from kpc.tools.bench import harness, kpbench, machine_limits, plot, results, tables
 from kpc.tools.bench.provenance import data_hash

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container import groups
 from kpc.format.container.container import Reader
-from kpc.format.container.scene_io import read, write
+from kpc.format.container.scene_io import read
 from kpc.format.scene.cameras import View, save_views
 from kpc.format.scene.rig import Rig
 from kpc.tools.cli import kpedit, kpinfo

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.images import linear_from_srgb, srgb_from_linear
-from kpc.format.container.scene_io import write
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import SPACE_PLANES, Clip, Decoder, Scene
 from kpc.player.cpu.reference import SceneAtTime

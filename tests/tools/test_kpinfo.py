@@ -8,10 +8,10 @@ import jsonschema
 import numpy as np
 import pytest
 
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container import groups
 from kpc.format.container.container import Reader
-from kpc.format.container.scene_io import write
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.motion import FINEST_STEP
 from kpc.player.app import kpplay

@@ -12,11 +12,11 @@ from PIL import Image
 
 import gl
 import kpc
+from kpc.encoder.coding.scene_writer import write
 from kpc.encoder.datasets.video import read_video
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import DisplayError
 from kpc.format.common.images import read_image
-from kpc.format.container.scene_io import write
 from kpc.format.scene.cameras import load_views
 from kpc.format.scene.metadata import Metadata, camera_document
 from kpc.player.app.camera_paths import CameraPath

@@ -9,9 +9,9 @@ import sys
 import numpy as np
 import pytest
 
+from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.images import write_image
-from kpc.format.container.scene_io import write
 from kpc.tools.cli import contactsheet, kpinfo, kpjoin
 from scenes import tiny_scene
 

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from kpc.encoder.coding import scene_writer
 from kpc.encoder.datasets import Dataset, load_dataset, pixel_rays
 from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, ValidationRays
 from kpc.encoder.field.config import TrainConfig
@@ -249,7 +250,7 @@ def _own_point(job: Job) -> Point | None:
     except TrainingError:
         return None
     searched = time.perf_counter()
-    data = scene_io.encode(coded.scene)
+    data = scene_writer.encode(coded.scene)
     encoded = time.perf_counter()
     scene = scene_io.read(data).dequantise()
     times = encoded - searched, time.perf_counter() - encoded
@@ -328,7 +329,9 @@ def _filled_planes(path: Path) -> Planes:
 def others_bytes(path: Path) -> int:
     """Return the stored bytes of all chunks but planes, in KPC's file of the scene."""
     source, _, _ = _source(path)
-    return _others_of(stored_bytes(scene_io.encode(source.coded or codec_model.code(source, Trade(), 0.0, 0).scene)))
+    return _others_of(
+        stored_bytes(scene_writer.encode(source.coded or codec_model.code(source, Trade(), 0.0, 0).scene))
+    )
 
 
 def _others_of(stored: Mapping[str, int]) -> int:

@@ -1,4 +1,4 @@
-"""The subcommands of kpbench that code scenes again: codec and entropy."""
+"""The subcommands of kpbench that code scenes: codec, entropy and decode."""
 
 import argparse
 import sys
@@ -8,7 +8,7 @@ from typing import Any
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
-from kpc.tools.bench import entropy_ablation, harness
+from kpc.tools.bench import decode_bench, harness
 from kpc.tools.bench.provenance import machine
 from kpc.tools.bench.records import Record
 
@@ -49,6 +49,15 @@ def add_parsers(kinds: Any) -> None:
     )
     harness.add_scenes(entropy)
     entropy.set_defaults(measure=_entropy)
+
+    decode = kinds.add_parser(
+        "decode",
+        help="how long the decoder core takes",
+        description="Decode all plane segments of each scene on one thread and on two, once everything is loaded.",
+    )
+    harness.add_scenes(decode)
+    harness.add_repeats([decode])
+    decode.set_defaults(measure=_decode)
 
 
 def _codec(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
@@ -95,7 +104,17 @@ def _codec(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
 
 def _entropy(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
     """Yield a record for each scene and variant of the entropy coder."""
+    from kpc.tools.bench import entropy_ablation  # here, since it needs numba
+
     for source in options.scenes:
         for variant, found in entropy_ablation.measure(source).items():
             record = harness.new_record("entropy", source, origin, {"variant": variant})
             yield record | {"seed": None, "renderer": "cpu", "repeats": [found]}
+
+
+def _decode(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
+    """Yield a record for each scene."""
+    for source in options.scenes:
+        record = harness.new_record("decode", source, origin, {})
+        repeats = [harness.isolated(decode_bench.measure, source) for _ in range(options.repeats)]
+        yield record | {"seed": None, "renderer": "cpu", "repeats": repeats}

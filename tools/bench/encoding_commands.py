@@ -10,7 +10,7 @@ from typing import Any
 
 from kpc.format.common import cli
 from kpc.format.common.memory import peak_memory_bytes
-from kpc.tools.bench import harness, machine_limits
+from kpc.tools.bench import harness
 from kpc.tools.bench.records import Record
 
 # A dataset, and the fields of `kpenc.Options` that differ between the runs of a record.
@@ -266,6 +266,8 @@ def _step_once(job: Any) -> tuple[str, Record]:
     """Profile a training step; return the device and the profile."""
     found: Record = harness.encoder().profile_steps(job)
     device = found.pop("device")
+    from kpc.tools.bench import machine_limits  # here, since it needs numba
+
     limits = {"limits": asdict(machine_limits.measure())} if device == "cpu" else {}
     return device, found | limits | {"peak_memory_bytes": peak_memory_bytes()}
 

@@ -1,6 +1,6 @@
 """What `kpbench entropy` measures: the contribution of each part of the entropy coder, on the planes of real files.
 
-A variant compiles `kpc.format.coding.predictive` or `kpc.format.coding.transform` once more with one of the functions
+A variant compiles `kpc.encoder.coding.predictive` or `kpc.encoder.coding.transform` once more with one of the functions
 they use replaced, and encodes the segments of a file again. Since the coder is lossless, sizes tell everything.
 Segments that do not use the changed part keep their size.
 """
@@ -16,11 +16,13 @@ from typing import Any, Protocol
 import numpy as np
 from numba import njit
 
-from kpc.format.coding import predictive, rans, texel_map, transform
+from kpc.encoder.coding import predictive, rans, texel_map, transform
+from kpc.encoder.coding.scene_writer import scene_chunks
+from kpc.encoder.coding.segments import encode_segment
 from kpc.format.coding.quantise import needed_texels
 from kpc.format.container.container import Chunk, Codec, pack
-from kpc.format.container.scene_io import SceneReader, read, scene_chunks
-from kpc.format.container.segments import SegmentSideInfo, encode_segment, side_info_at
+from kpc.format.container.scene_io import SceneReader, read
+from kpc.format.container.segments import SegmentSideInfo, side_info_at
 from kpc.format.scene.scene import ALL_PLANES
 
 # Decodings of which the median time counts, after one that warms up.

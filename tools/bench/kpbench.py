@@ -11,6 +11,7 @@
     kpbench steady room.kpc liam.kpc --out docs/bench/steady.json
     kpbench codec room.kpck liam.kpc --dataset room --dataset liam --out docs/bench/codec.json
     kpbench entropy room.kpc liam.kpc --out docs/bench/entropy.json
+    kpbench decode room.kpc liam.kpc --out docs/bench/decode.json
 
 Every record states what was run (commit, command, seed, settings), on what (machine, renderer, versions, SHA-256 of the
 data) and the result of every repeat; see `kpc.tools.bench.records`. The output is one JSON list: with --out it is
@@ -66,7 +67,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     cli.add_version_option(parser)
     kinds = parser.add_subparsers(
-        dest="kind", required=True, metavar="encode|curve|ablate|step|groups|player|stream|window|steady|codec|entropy"
+        dest="kind",
+        required=True,
+        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|codec|entropy|decode",
     )
     for module in (encoding_commands, playing_commands, coding_commands):
         module.add_parsers(kinds)

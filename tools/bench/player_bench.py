@@ -21,7 +21,6 @@ from kpc.player.gl.renderer import Renderer, tries_compute
 from kpc.player.quality import LEVELS, Quality
 from kpc.player.viewpoints import fit_camera, orbit
 from kpc.tools.bench.harness import size_text
-from kpc.tools.bench.machine_limits import texel_rate
 from kpc.tools.bench.records import Record
 
 # Frames drawn before those that are timed.
@@ -156,6 +155,8 @@ def _texel_rates(stage: _Stage, renderer: Renderer, shader: str, frame_ms: float
     ):
         return {}
     texels = renderer.texels_per_sample * float(renderer.render(stage.camera, 1.0).samples.sum())
+    from kpc.tools.bench.machine_limits import texel_rate  # here, since it needs numba
+
     peak = texel_rate(stage.ctx, shader == "compute", renderer.plane_dtype)
     return {"texels_per_frame": texels, "share_of_texel_rate": texels / (1e-3 * frame_ms) / peak}
 

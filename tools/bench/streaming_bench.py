@@ -19,7 +19,7 @@ import numpy as np
 from kpc.format.common.errors import KpcError
 from kpc.format.common.fidelity import psnr_from_mse
 from kpc.format.container.partial import PartialScene
-from kpc.format.container.scene_io import SceneReader, encode, read
+from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.container.sources import open_source
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import TIME_PLANES, Clip
@@ -182,6 +182,8 @@ def _repeated(path: Path, folder: Path) -> Path:
         occupancy=np.tile(scene.occupancy, (REPETITIONS, 1, 1, 1)),
     )
     out = folder / path.name
+    from kpc.encoder.coding.scene_writer import encode  # here, since it needs numba
+
     out.write_bytes(encode(repeated, compress=False))
     return out
 

@@ -279,6 +279,14 @@ COLUMNS: dict[str, list[Column]] = {
         ("file KB", _number("file_bytes", "{:.1f}", 1e3)),
         ("reading ms", _number("read_ms", "{:.0f}")),
     ],
+    "decode": [
+        ("scene", _name),
+        ("segments", _number("segments", "{:.0f}")),
+        ("symbols", _number("symbols", "{:.0f}")),
+        ("one thread ms", _number("decode_ms", "{:.1f}")),
+        ("two threads ms", _number("two_threads_ms", "{:.1f}")),
+        ("slowest segment ms", _number("slowest_segment_ms", "{:.1f}")),
+    ],
 }
 
 # Columns of the table that kpbench prints, which is to fit a terminal; all others are in its JSON.
@@ -295,6 +303,7 @@ PRINTED: dict[str, tuple[str, ...]] = {
     "codec": ("scene", "coder", "KB at 0.15 dB loss", "PSNR loss dB", "encode s", "decode s"),
     "groups": ("dataset", "groups", "file KB", "PSNR dB", "encoded in s", "peak MB, all"),
     "entropy": ("scene", "variant", "planes KB", "decoding ms", "file KB", "reading ms"),
+    "decode": ("scene", "segments", "symbols", "one thread ms", "two threads ms", "slowest segment ms"),
 }
 PRINTED_NAME = 22  # characters of a cell that are printed; names of datasets may be longer
 
@@ -311,6 +320,7 @@ TITLES = {
     "steady": "Long playback with all panels open",
     "codec": "Coding, beside general-purpose codecs",
     "entropy": "Entropy coding of planes, ablations, on one core",
+    "decode": "Decoding by the decoder core",
 }
 
 

@@ -30,8 +30,7 @@ from kpc.format.common.version import VERSION
 from kpc.format.container.groups import Groups, load
 from kpc.format.container.metadata_chunk import META_LIMIT
 from kpc.format.container.metadata_options import add_metadata_options, members_from, with_view_limits
-from kpc.format.container.rewriting import with_metadata
-from kpc.format.container.scene_io import save
+from kpc.format.container.rewriting import save, with_metadata
 from kpc.format.scene.cameras import Camera, load_views
 from kpc.format.scene.metadata import HISTORY_LIMIT, Metadata, camera_document
 from kpc.format.scene.view_limits import find_view, view_members

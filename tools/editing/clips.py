@@ -8,7 +8,7 @@ import numpy as np
 
 from kpc.format.coding.quantise import QuantisedScene
 from kpc.format.common.errors import UsageError
-from kpc.format.container import groups, scene_io
+from kpc.format.container import groups, rewriting
 from kpc.format.container.rewriting import with_metadata
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Clip
@@ -73,7 +73,7 @@ def edit(source: Path, output: Path, edits: Edits, metadata: Metadata) -> tuple[
     data = edited(clip.open(0), change)
     if kept:
         metadata = _in_part(metadata, kept[0], clip.clip)
-    return scene_io.save(with_metadata(data, metadata), output), kept[0] if kept else None
+    return rewriting.save(with_metadata(data, metadata), output), kept[0] if kept else None
 
 
 def _edit_groups(

@@ -7,7 +7,7 @@ import numpy as np
 from kpc.format.coding.quantise import QuantisedScene, needed_texels
 from kpc.format.container.container import Chunk, Codec, Entry, assemble, store
 from kpc.format.container.rewriting import copied
-from kpc.format.container.scene_io import SceneReader, read, scene_chunks
+from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.container.scene_layout import KNOWN_KINDS
 from kpc.format.container.segments import needs_occupancy
 from kpc.format.scene.scene import ALL_PLANES
@@ -26,6 +26,8 @@ def edited(reader: SceneReader, edit: Edit) -> bytes:
     Raises:
         UsageError, FormatError: as `edit`, or no file can hold the result.
     """
+    from kpc.encoder.coding.scene_writer import scene_chunks  # here, since copying alone needs no numba
+
     before = read(reader)
     after = edit(before)
     numbers = {_place_in(entry): number for number, entry in enumerate(reader.index)}

@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, looked_up_cells, needed_texels
-from kpc.format.coding.transform import decode_levels, encode_blocks
 from kpc.format.container.segments import TransformSegments
 
 
@@ -38,6 +37,8 @@ def _recoded(
     plane: QuantisedPlane, coded: np.ndarray, implied_before: np.ndarray, implied: np.ndarray
 ) -> TransformSegments:
     """Return the segments of a plane under TRANSFORM with the same levels and another map; see `without_unread`."""
+    from kpc.encoder.coding.transform import decode_levels, encode_blocks  # here, since they need numba
+
     assert isinstance(plane.side_info, TransformSegments)
     rows, columns, channels = plane.symbols.shape
     segments = {}

@@ -12,20 +12,14 @@ import google_crc32c
 import numpy as np
 import zstandard
 
+from kpc.encoder.coding.predictive import encode_with_weights, follows_trellis
+from kpc.encoder.coding.scene_writer import scene_chunks
+from kpc.encoder.coding.transform import OFFSET_COUNT, TransformBlocks, coded_blocks, encode_blocks, largest_side
 from kpc.format.coding.poses import BITS, LENS, NOTHING, WORD
 from kpc.format.coding.poses import HEAD as POSES_HEAD
-from kpc.format.coding.predictive import (
-    DEPENDENT,
-    SCALAR,
-    TRELLIS,
-    WEIGHT_COUNT,
-    encode_with_weights,
-    follows_trellis,
-)
 from kpc.format.coding.quantise import QuantisedScene, needed_texels
-from kpc.format.coding.transform import OFFSET_COUNT, TransformBlocks, coded_blocks, encode_blocks, largest_side
 from kpc.format.container.container import HEADER, Chunk, Codec, Entry, Reader, header_and_index, stored_frame
-from kpc.format.container.scene_io import scene_chunks
+from kpc.format.container.segments import DEPENDENT, SCALAR, TRELLIS, WEIGHT_COUNT
 from kpc.format.scene.scene import ALL_PLANES
 from kpc.tools.vectors.scenes import dependent, noise
 

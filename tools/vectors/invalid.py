@@ -8,15 +8,16 @@ from functools import partial
 
 import numpy as np
 
-from kpc.format.coding.motion_codec import encode_motion
-from kpc.format.coding.occupancy_codec import encode_occupancy
+from kpc.encoder.coding.motion_codec import encode_motion
+from kpc.encoder.coding.occupancy_codec import encode_occupancy
+from kpc.encoder.coding.predictive import encode_with_weights
+from kpc.encoder.coding.scene_writer import scene_chunks
+from kpc.encoder.coding.transform import HEAD, TransformBlocks, encode_blocks
 from kpc.format.coding.poses import HEAD as POSES_HEAD
 from kpc.format.coding.poses import ROOT
-from kpc.format.coding.predictive import DEPENDENT, SCALAR, TRELLIS, WEIGHT_COUNT, encode_with_weights
-from kpc.format.coding.transform import HEAD, TransformBlocks, encode_blocks
 from kpc.format.container.container import HEADER, Chunk, Codec, Reader
-from kpc.format.container.scene_io import scene_chunks
 from kpc.format.container.scene_layout import CAMERA_STRUCT, DECODER_STRUCT, MOTION_STRUCT
+from kpc.format.container.segments import DEPENDENT, SCALAR, TRELLIS, WEIGHT_COUNT
 from kpc.format.scene.scene import ALL_PLANES
 from kpc.tools.vectors.files import (
     Stored,
@@ -33,7 +34,7 @@ from kpc.tools.vectors.files import (
     with_field,
     with_index,
 )
-from kpc.tools.vectors.scenes import hybrid_decoder, make_scene, noise, smooth_motion, walked
+from kpc.tools.vectors.scenes import first_symbol, hybrid_decoder, make_scene, noise, smooth_motion, walked
 
 BROKEN = "FormatError"
 Refused = tuple[bytes, str, str]  # a file, the name of the error, a part of its message
@@ -308,8 +309,6 @@ def _motion(good: Good) -> dict[str, Refused]:
     """Return files with damaged motion grids, raw and under MOTION."""
     grid = smooth_motion(3, 2, 2, 2)
     body = MOTION_STRUCT.pack(3, 2, 2, 2, grid.step) + encode_motion(grid.symbols)
-    leaving = np.zeros((2, 2, 2, 2, 3), np.int32)
-    leaving[0, 0, 0, 0, 0] = 40_000
     head = MOTION_STRUCT.pack(2, 2, 2, 2, grid.step)
 
     def file(body: bytes, raw_length: int = 12 + 6 * 24) -> bytes:
@@ -324,7 +323,7 @@ def _motion(good: Good) -> dict[str, Refused]:
     static = [raw(chunk) for chunk in [*scene_chunks(still), Chunk("MOVE", move(2, 2, 2, 2, fine))]]
     vast = struct.pack("<4HfI", 50, 60, 60, 20, grid.step, 1 << 16)
     files = {
-        "motion-range": (file(head + encode_motion(leaving), 12 + 6 * 16), "leaves its 16 bits"),
+        "motion-range": (file(head + first_symbol(40_000), 12 + 6 * 16), "leaves its 16 bits"),
         "motion-rows": (file(patched(body, 0, "<H", 1)), "makes no sense"),
         "motion-step": (file(patched(body, 8, "<f", NAN)), "outside its range"),
         "motion-length": (file(body, 12 + 6 * 24 + 1), "claims 157 bytes"),

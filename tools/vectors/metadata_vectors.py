@@ -4,9 +4,9 @@ import json
 from collections.abc import Callable
 from typing import Any
 
+from kpc.encoder.coding.scene_writer import scene_chunks
 from kpc.format.container.container import Chunk
 from kpc.format.container.metadata_chunk import DEPTH_LIMIT, MEMBER_LIMIT, META_LIMIT, TEXT_LIMIT
-from kpc.format.container.scene_io import scene_chunks
 from kpc.tools.vectors.files import Stored, assemble, raw, value_count, zstd
 from kpc.tools.vectors.scenes import make_scene
 

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from kpc.format.coding.predictive import DEPENDENT, MAX_DECISIONS, PredictionWeights, code_symbols, trellis_transition
+from kpc.encoder.coding import motion_codec
+from kpc.encoder.coding.predictive import MAX_DECISIONS, code_symbols, trellis_transition
+from kpc.encoder.coding.rans import code_signed, encode_trace, new_models
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels
-from kpc.format.coding.rans import encode_trace
-from kpc.format.coding.texel_map import MODE_BITS
+from kpc.format.container.segments import DEPENDENT, MODE_BITS, PredictionWeights
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.scene.scene import (
@@ -252,3 +253,20 @@ def smooth(scene: QuantisedScene) -> QuantisedScene:
         return replace(plane, symbols=(np.minimum(index, 511 - index) - 128).astype(np.int8), coded=plane.coded | True)
 
     return map_planes(scene, slow)
+
+
+def first_symbol(symbol: int) -> bytes:
+    """Return the coded data of a motion grid up to its first symbol."""
+    trace = np.empty(motion_codec.MAX_DECISIONS, np.int16)
+    *_, position = code_signed(
+        symbol,
+        new_models(motion_codec.MODELS_PER_CONTEXT),
+        0,
+        motion_codec.UNARY,
+        motion_codec.ESCAPES,
+        0,
+        0,
+        None,
+        trace,
+    )
+    return encode_trace(trace[:position])

@@ -5,11 +5,10 @@ from functools import partial
 
 import numpy as np
 
+from kpc.encoder.coding.scene_writer import scene_chunks
 from kpc.format.coding.poses import BITS, NOTHING, ROOT
-from kpc.format.coding.predictive import WEIGHT_COUNT
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.container.container import Chunk, Reader
-from kpc.format.container.scene_io import scene_chunks
 from kpc.format.container.scene_layout import (
     APPEARANCE_LIMIT,
     AXIS_LIMIT,
@@ -23,6 +22,7 @@ from kpc.format.container.scene_layout import (
     SAMPLE_LIMIT,
     SCALE_LIMIT,
 )
+from kpc.format.container.segments import WEIGHT_COUNT
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.scene.scene import SPACE_PLANES, Appearance, Clip, Decoder, HybridDecoder

@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from kpc.format.common.jit import compiled
+from kpc.jit import compiled
 
 # Not "reassoc": the order of sums would differ between code compiled in this process and the same code from numba's
 # cache, so that the first training run on a machine would end elsewhere than the second.

@@ -22,7 +22,7 @@ Names in this module
     mean        the coefficient of i = j = 0, in 1/UNITS_PER_SYMBOL; coded as its difference from the prediction
     gap         (2, N), along the left and upper side of a block: by how much the texels across the border exceed what
                 block is so far known to be there, in 1/UNITS_PER_SYMBOL
-    state position words trace      of `kpc.format.coding.rans`
+    state position words trace      of `kpc.encoder.coding.rans`
 
 Kernels have more than ten parameters and the module more than 500 lines, since numba keeps
 their state in registers only as scalars.
@@ -32,20 +32,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kpc.format.coding.rans import (
+from kpc.encoder.coding.rans import (
     SCALE,
-    check_end,
     code_bit,
     code_bit_adaptive,
     code_unsigned,
     encode_trace,
     log_class,
     new_models,
-    open_stream,
 )
-from kpc.format.coding.texel_map import MAP_CODED, MAP_IMPLIED, code_map, initial_map, map_mode
-from kpc.format.common.errors import FormatError
-from kpc.format.common.jit import compiled, inlined
+from kpc.encoder.coding.texel_map import code_map, map_mode
+from kpc.format.container.segments import MAP_CODED, MAP_IMPLIED
+from kpc.jit import compiled, inlined
 
 SIDES = (4, 8, 16)
 HEAD = 3  # bytes before the words
@@ -164,55 +162,28 @@ def encode_blocks(blocks: TransformBlocks, coded: np.ndarray, implied: np.ndarra
     return bytes([side, mode, blocks.quantiser]) + encode_trace(trace[:position])
 
 
-def decode_blocks(
-    body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Decode what `encode_blocks` made.
-
-    Returns:
-        (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels.
-
-    Raises:
-        FormatError: the body is cut off, too long or damaged.
-    """
-    symbols, coded, _ = _decode(body, rows, columns, channels, implied, None)
-    return symbols, coded
-
-
 def decode_levels(
     body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None = None
 ) -> TransformBlocks:
-    """Return what `encode_blocks` was given, from what it made; levels that are not coded are 0."""
-    side = body[0]
-    levels = np.zeros((channels, *coded_blocks(np.zeros((rows, columns), bool), side).shape, side, side), np.int64)
-    _, _, step_offsets = _decode(body, rows, columns, channels, implied, levels)
-    return TransformBlocks(levels, step_offsets, body[2])
+    """Return what `encode_blocks` was given, from what it made; levels that are not coded are 0.
 
+    The decoder core does not hand out levels, which only those need who encode the blocks again.
 
-def _decode(
-    body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None, levels: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return symbols, coded texels and step offsets, and fill `levels` in."""
-    if len(body) < HEAD or body[0] not in SIDES or body[1] > MAP_IMPLIED or body[2] == 0:
-        raise FormatError("plane segment: unknown side of blocks or flag, or a step of 0")
-    side, mode = body[0], body[1]
-    if side > largest_side(rows, columns):
-        raise FormatError(f"plane segment: blocks of {side}, more than twice its {min(rows, columns)} rows or columns")
-    state, words = open_stream(body[HEAD:], "plane segment")
-    symbols, coded = np.zeros((rows, columns, channels), np.int8), initial_map(mode, rows, columns, implied)
-    position = 0
+    Args:
+        body: that the core has decoded with the same arguments.
+    """
+    side, mode, quantiser = body[0], body[1], body[2]
+    coded = np.ones((rows, columns), bool) if implied is None or mode != MAP_IMPLIED else np.array(implied, order="C")
+    state, words, position = int.from_bytes(body[HEAD : HEAD + 4], "little"), np.frombuffer(body, "<u2", offset=7), 0
+    words = words.astype(np.uint16)
     if mode == MAP_CODED:
         state, position = code_map(coded, state, position, words, None)
     busy = coded_blocks(coded, side)
-    offsets, steps = np.zeros(busy.shape, np.int64), step_table(side, body[2])
-    if position <= len(words):
-        state, position = code_offsets(offsets, busy, state, position, words, None)
-    if position <= len(words):
-        state, position = code_levels(
-            levels, offsets, busy, steps, state, position, words, None, symbols, dct_basis(side), coded
-        )
-    check_end(state, position, words, "plane segment")
-    return symbols, coded, offsets
+    levels, offsets = np.zeros((channels, *busy.shape, side, side), np.int64), np.zeros(busy.shape, np.int64)
+    state, position = code_offsets(offsets, busy, state, position, words, None)
+    symbols, steps = np.zeros((rows, columns, channels), np.int8), step_table(side, quantiser)
+    code_levels(levels, offsets, busy, steps, state, position, words, None, symbols, dct_basis(side), coded)
+    return TransformBlocks(levels, offsets, quantiser)
 
 
 # --- kernels that encoder and decoder share

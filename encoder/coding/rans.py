@@ -16,8 +16,7 @@ A decoder that runs out of words reads zeros, and `position` goes on beyond the 
 
 import numpy as np
 
-from kpc.format.common.errors import FormatError
-from kpc.format.common.jit import compiled, inlined
+from kpc.jit import compiled, inlined
 
 # The state lies in [LOWEST_STATE, 2^32) between bits. An encoder begins with LOWEST_STATE, so there a decoder must end.
 LOWEST_STATE = 1 << 16
@@ -166,32 +165,5 @@ def trace_words(trace):
 
 
 def encode_trace(trace: np.ndarray) -> bytes:
-    """Return a trace as the bytes that `open_stream` takes: state (u32) and words (u16)."""
+    """Return a trace as the bytes that a decoder takes: state (u32) and words (u16)."""
     return bytes(trace_words(trace).astype("<u2").tobytes())
-
-
-def open_stream(body: bytes, what: str) -> tuple[int, np.ndarray]:
-    """Return the first state and the (N,) uint16 words of what `encode_trace` made.
-
-    Args:
-        what: the content, for messages.
-
-    Raises:
-        FormatError: the stream is cut off, or its state is out of range.
-    """
-    if len(body) < 4 or len(body) % 2:
-        raise FormatError(f"{what}: cut off within its words")
-    state = int.from_bytes(body[:4], "little")
-    if state < LOWEST_STATE:
-        raise FormatError(f"{what}: its first state is too small")
-    return state, np.frombuffer(body, "<u2", offset=4).astype(np.uint16)
-
-
-def check_end(state: int, position: int, words: np.ndarray, what: str) -> None:
-    """Check that after the last bit all words are used and the state is the one an encoder begins with.
-
-    Raises:
-        FormatError: it is not so.
-    """
-    if position != len(words) or state != LOWEST_STATE:
-        raise FormatError(f"{what}: its words do not end where they should")

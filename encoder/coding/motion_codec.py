@@ -14,9 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kpc.format.coding.rans import check_end, code_signed, encode_trace, log_class, new_models, open_stream
-from kpc.format.common.errors import FormatError
-from kpc.format.common.jit import compiled, inlined
+from kpc.encoder.coding.rans import code_signed, encode_trace, log_class, new_models
+from kpc.jit import compiled, inlined
 
 WEIGHT_BITS = 6  # weights are multiples of 2^-WEIGHT_BITS
 UNARY, ESCAPES = 4, 15  # of `code_signed`: residuals reach +-65535
@@ -96,49 +95,23 @@ def cubic_weights(middle: int, positions: list[int | None]) -> list[int]:
 
 def encode_motion(symbols: np.ndarray) -> bytes:
     """Encode (T, Nz, Ny, Nx, 3) int16 symbols, the sizes at least 2."""
-    trace = np.empty(symbols.size * MAX_DECISIONS, np.int16)
-    _, position, _ = _code_grid(symbols.astype(np.int32), 0, None, trace)
+    trace, position = np.empty(symbols.size * MAX_DECISIONS, np.int16), 0
+    models, residuals = new_models(CONTEXTS * MODELS_PER_CONTEXT), np.zeros(symbols.shape, np.int32)
+    wide = symbols.astype(np.int32)
+    for one in coding_passes(symbols.shape[:4]):
+        values, r = (np.moveaxis(a, one.axis, 0) for a in (wide, residuals))
+        position = code_pass(values, r, one.new, one.references, one.weights, *one.others, models, position, trace)
     return encode_trace(trace[:position])
 
 
-def decode_motion(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
-    """Undo `encode_motion`: return int16 symbols of that shape.
-
-    Raises:
-        FormatError: the body is cut off, too long or damaged.
-    """
-    state, words = open_stream(body, "motion")
-    symbols = np.zeros(shape, np.int32)
-    state, position, fits = _code_grid(symbols, state, words, None)
-    if not fits:
-        raise FormatError("motion: a symbol leaves its 16 bits")
-    check_end(state, position, words, "motion")
-    return symbols.astype(np.int16)
-
-
-def _code_grid(
-    symbols: np.ndarray, state: int, words: np.ndarray | None, trace: np.ndarray | None
-) -> tuple[int, int, bool]:
-    """Code int32 symbols: (state, position, whether all fit 16 bits)."""
-    models, residuals = new_models(CONTEXTS * MODELS_PER_CONTEXT), np.zeros(symbols.shape, np.int32)
-    position, fits = 0, True
-    for one in coding_passes(symbols.shape[:4]):
-        values, r = (np.moveaxis(a, one.axis, 0) for a in (symbols, residuals))
-        state, position, fits = code_pass(
-            values, r, one.new, one.references, one.weights, *one.others, models, state, position, words, trace
-        )
-        if not fits or (words is not None and position > words.size):
-            break
-    return state, position, fits
-
-
 @compiled()
-def code_pass(values, r, new, references, weights, first, second, third, models, state, position, words, trace):
-    """Code the nodes of a `CodingPass`, whose axis is the first of (n, ., ., ., M) `values` and `r`: (state,
-    position, whether all fit).
+def code_pass(values, r, new, references, weights, first, second, third, models, position, trace):
+    """Code the nodes of a `CodingPass`, whose axis is the first of (n, ., ., ., M) `values` and `r`; return the
+    position in the trace.
 
     Its parameters are many because numba takes no dataclass such as `CodingPass`.
     """
+    state = 0
     for n in range(new.size):
         for i in range(first.size):
             for j in range(second.size):
@@ -148,25 +121,12 @@ def code_pass(values, r, new, references, weights, first, second, third, models,
                     for m in range(values.shape[4]):
                         predicted = interpolate(values, references[n], weights[n], a, b, c, m)
                         context = residual_context(r, new[n], references[n], weights[n], beside, a, b, c, m)
-                        residual, state, position = code_signed(
-                            values[new[n], a, b, c, m] - predicted,
-                            models,
-                            context * MODELS_PER_CONTEXT,
-                            UNARY,
-                            ESCAPES,
-                            state,
-                            position,
-                            words,
-                            trace,
+                        residual, model = values[new[n], a, b, c, m] - predicted, context * MODELS_PER_CONTEXT
+                        _, state, position = code_signed(
+                            residual, models, model, UNARY, ESCAPES, state, position, None, trace
                         )
-                        value = predicted + residual
-                        if not -32768 <= value <= 32767:
-                            return state, position, False
-                        values[new[n], a, b, c, m] = value
                         r[new[n], a, b, c, m] = abs(residual)
-                if words is not None and position > words.size:
-                    return state, position, True
-    return state, position, True
+    return position
 
 
 @inlined

@@ -27,21 +27,25 @@ Names in this module
     w n nw ne ...   neighbours by compass direction; ww and nn are two texels away
     cross           residuals of the channels before, smoothed
     trellis         state of the trellis, 0 to 7; odd where the symbol, or the difference, has to be odd
-    state position words trace      of `kpc.format.coding.rans`
+    state position words trace      of `kpc.encoder.coding.rans`
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 
-from kpc.format.coding.rans import check_end, code_signed, encode_trace, new_models, open_stream
-from kpc.format.coding.texel_map import MAP_CODED, MAP_IMPLIED, MODE_BITS, code_map, initial_map, map_mode
-from kpc.format.common.errors import FormatError
-from kpc.format.common.jit import compiled, inlined
+from kpc.encoder.coding.rans import code_signed, encode_trace, new_models
+from kpc.encoder.coding.texel_map import code_map, map_mode
+from kpc.format.container.segments import (
+    DEPENDENT,
+    MAP_CODED,
+    MODE_BITS,
+    SCALAR,
+    TRELLIS,
+    WEIGHT_COUNT,
+    PredictionWeights,
+)
+from kpc.jit import compiled, inlined
 
 SET_COUNTS = (1, 2, 4, 8)  # sets of weights that a segment may have
-WEIGHT_COUNT = 9  # weights of a set, each in 1/64
-SCALAR, TRELLIS, DEPENDENT = range(3)  # quantisers; in the flags above the map mode
 FLAT_ACTIVITY = 4  # neighbourhoods whose activity is less than this are flat
 
 UNARY, ESCAPES = 4, 7  # of `code_signed`, for residuals
@@ -62,20 +66,6 @@ GRADIENT_CLASSES = np.array([min(k.bit_length(), 7) for k in range(5 * 255 + 1)]
 _LOGARITHMS = np.array(
     [0, 0] + [2 * (k.bit_length() - 2) + (k >> k.bit_length() - 2 & 1) for k in range(2, 2443)], np.int8
 )
-
-
-@dataclass(frozen=True, eq=False)
-class PredictionWeights:
-    """Weights that the symbols of a DEPENDENT plane were chosen with; with others they take far more bits.
-
-    Attributes:
-        weights: (C, WEIGHT_COUNT) int8, in 1/64; C is one of SET_COUNTS.
-    """
-
-    weights: np.ndarray
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, PredictionWeights) and np.array_equal(self.weights, other.weights)
 
 
 def encode_symbols(
@@ -119,57 +109,6 @@ def encode_with_weights(
         return None
     head = bytes([len(weights), mode | quantiser << MODE_BITS])
     return head + weights.tobytes() + encode_trace(trace[:position])
-
-
-def decode_symbols(
-    body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Undo `encode_symbols`.
-
-    Returns:
-        (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels.
-
-    Raises:
-        FormatError: the body is cut off, too long or damaged.
-    """
-    weights, mode, quantiser = _parse_head(body)
-    state, words = open_stream(body[2 + weights.size :], "plane segment")
-    symbols, coded = np.zeros((rows, columns, channels), np.int8), initial_map(mode, rows, columns, implied)
-    position, fits = 0, True
-    if mode == MAP_CODED:
-        state, position = code_map(coded, state, position, words, None)
-    if position <= len(words):
-        state, position, fits = code_symbols(symbols, coded, quantiser, weights, state, position, words, None, None)
-    if not fits:
-        raise FormatError("plane segment: a symbol leaves its 8 bits")
-    check_end(state, position, words, "plane segment")
-    return symbols, coded
-
-
-def weights_in(body: bytes) -> PredictionWeights | None:
-    """Return the side information in what `decode_symbols` decodes; None where the symbols are not DEPENDENT.
-
-    Raises:
-        FormatError: as `decode_symbols`.
-    """
-    weights, _, quantiser = _parse_head(body)
-    return PredictionWeights(weights) if quantiser == DEPENDENT else None
-
-
-def needs_occupancy(body: bytes) -> bool:
-    """Return whether the map of a segment follows from the occupancy."""
-    return len(body) > 1 and body[1] & (1 << MODE_BITS) - 1 == MAP_IMPLIED
-
-
-def _parse_head(body: bytes) -> tuple[np.ndarray, int, int]:
-    """Return weights, map mode and quantiser."""
-    flags, sets = (body[1], body[0]) if len(body) > 1 else (255, 0)
-    mode, quantiser = flags & (1 << MODE_BITS) - 1, flags >> MODE_BITS
-    if mode > MAP_IMPLIED or quantiser > DEPENDENT or sets not in SET_COUNTS:
-        raise FormatError("plane segment: unknown number of sets of weights or flag")
-    if len(body) < 2 + WEIGHT_COUNT * sets:
-        raise FormatError("plane segment: cut off within its weights")
-    return np.frombuffer(body, np.int8, WEIGHT_COUNT * sets, 2).reshape(sets, WEIGHT_COUNT), mode, quantiser
 
 
 # --- weights

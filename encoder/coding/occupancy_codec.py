@@ -6,8 +6,8 @@ The context is made of cells around it and of the slot before: where these agree
 
 import numpy as np
 
-from kpc.format.coding.rans import check_end, code_bit_adaptive, encode_trace, new_models, open_stream
-from kpc.format.common.jit import compiled
+from kpc.encoder.coding.rans import code_bit_adaptive, encode_trace, new_models
+from kpc.jit import compiled
 
 # (slot, z, y, x) from a cell to those of its context, the most significant bit first. `code_cells` reads them row by
 # row.
@@ -33,28 +33,16 @@ def encode_occupancy(occupancy: np.ndarray) -> bytes:
     """Encode (slots, Nz, Ny, Nx) bool."""
     cells = np.array(occupancy, np.uint8, order="C")
     trace = np.empty(cells.size, np.int16)
-    code_cells(cells, 0, 0, None, trace)
+    code_cells(cells, trace)
     return encode_trace(trace)
 
 
-def decode_occupancy(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
-    """Undo `encode_occupancy`: return bool of that shape.
-
-    Raises:
-        FormatError: the body is cut off or too long.
-    """
-    state, words = open_stream(body, "occupancy")
-    cells = np.zeros(shape, np.uint8)
-    state, position = code_cells(cells, state, 0, words, None)
-    check_end(state, position, words, "occupancy")
-    return cells.view(bool)
-
-
 @compiled()
-def code_cells(cells, state, position, words, trace):
-    """Code (slots, Nz, Ny, Nx) uint8 `cells` of 0 and 1: (state, position), as of `kpc.format.coding.rans`."""
+def code_cells(cells, trace):
+    """Code (slots, Nz, Ny, Nx) uint8 `cells` of 0 and 1, a decision of the trace for each."""
     S, Z, Y, X = cells.shape
     models, outside = new_models(CONTEXTS), np.zeros(X, np.uint8)
+    state, position = 0, 0
     for s in range(S):
         for z in range(Z):
             for y in range(Y):
@@ -84,10 +72,6 @@ def code_cells(cells, state, position, words, trace):
                         | int(pb[x])
                     )
                     left, state, position = code_bit_adaptive(
-                        int(here[x]), models, context, state, position, words, trace
+                        int(here[x]), models, context, state, position, None, trace
                     )
-                    here[x] = left
                     past = now
-                if words is not None and position > words.size:
-                    return state, position
-    return state, position

@@ -6,13 +6,10 @@ maps of space planes saves 0.4 KB a file (shelf_hand, liam).
 
 import numpy as np
 
-from kpc.format.coding.rans import code_bit_adaptive, new_models
-from kpc.format.common.errors import FormatError
-from kpc.format.common.jit import compiled
+from kpc.encoder.coding.rans import code_bit_adaptive, new_models
+from kpc.format.container.segments import MAP_ALL, MAP_CODED, MAP_IMPLIED
+from kpc.jit import compiled
 
-# Map modes: all texels are coded; the map is stored or coded; it follows from the occupancy (`needed_texels`).
-MAP_ALL, MAP_CODED, MAP_IMPLIED = range(3)
-MODE_BITS = 2  # of the flags of a segment under a context codec, the lowest
 MAP_CONTEXTS = 1 << 10
 
 
@@ -26,19 +23,6 @@ def map_mode(coded: np.ndarray, implied: np.ndarray | None) -> int:
     if coded.all():
         return MAP_ALL
     return MAP_IMPLIED if implied is not None and np.array_equal(coded, implied) else MAP_CODED
-
-
-def initial_map(mode: int, rows: int, columns: int, implied: np.ndarray | None) -> np.ndarray:
-    """Return the (rows, columns) bool map of a segment, or for MAP_CODED an array to decode it into.
-
-    Raises:
-        FormatError: the map follows from an occupancy that is not known.
-    """
-    if mode != MAP_IMPLIED:
-        return np.ones((rows, columns), bool)
-    if implied is None:
-        raise FormatError("plane segment: its map follows from an occupancy that is not known")
-    return np.array(implied, order="C")
 
 
 @compiled()

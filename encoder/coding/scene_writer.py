@@ -10,16 +10,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from kpc.format.coding.motion_codec import encode_motion
-from kpc.format.coding.occupancy_codec import encode_occupancy
+from kpc.encoder.coding.motion_codec import encode_motion
+from kpc.encoder.coding.occupancy_codec import encode_occupancy
+from kpc.encoder.coding.raw_planes import encode_raw_segment
+from kpc.encoder.coding.segments import choose_codec
+from kpc.encoder.coding.weights import encode_weights
 from kpc.format.coding.poses import encode_poses
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels
-from kpc.format.coding.raw_planes import encode_raw_segment
-from kpc.format.coding.weights import encode_weights
-from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import FormatError
 from kpc.format.container.container import Chunk, Codec, pack
 from kpc.format.container.metadata_chunk import pack_metadata
+from kpc.format.container.rewriting import save
 from kpc.format.container.scene_layout import (
     MOTION_STRUCT,
     OCCUPANCY_STRUCT,
@@ -37,7 +38,7 @@ from kpc.format.container.scene_layout import (
     parse_mapping,
     parse_motion,
 )
-from kpc.format.container.segments import choose_codec, rows_per_segment, side_info_at
+from kpc.format.container.segments import rows_per_segment, side_info_at
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder
@@ -54,16 +55,6 @@ def write(scene: QuantisedScene, path: str | os.PathLike[str], *, segment_rows: 
         FormatError: the scene breaks a rule that every reader checks; the message says which.
     """
     return save(encode(scene, segment_rows=segment_rows), path)
-
-
-def save(data: bytes, path: str | os.PathLike[str]) -> int:
-    """Write what `encode` returned; return its size. On failure the file at `path` is unchanged."""
-    try:
-        with atomic_write(path) as aside:
-            aside.write_bytes(data)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, os.fspath(path)) from error
-    return len(data)
 
 
 def encode(scene: QuantisedScene, *, segment_rows: int | None = None, compress: bool = True) -> bytes:

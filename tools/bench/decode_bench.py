@@ -1,0 +1,41 @@
+"""Time of decoding the plane segments of a file by the decoder core, on one thread and on two."""
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from kpc.format.container.scene_io import SceneReader
+from kpc.tools.bench.records import Record
+
+
+def measure(path: Path) -> Record:
+    """Return what decoding a file takes, in milliseconds, once everything is loaded."""
+    reader = SceneReader(path)
+    segments = [number for number, entry in enumerate(reader.index) if entry.kind == "PLNE"]
+
+    def decode(number: int) -> float:
+        start = time.perf_counter()
+        reader.segment(number)
+        return 1e3 * (time.perf_counter() - start)
+
+    first_ms = _elapsed_ms(lambda: list(map(decode, segments)))  # loads the module, and reads the file
+    each: list[float] = []
+    one_thread_ms = _elapsed_ms(lambda: each.extend(map(decode, segments)))
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(decode, segments))  # each thread gets an instance of its own
+        two_threads_ms = _elapsed_ms(lambda: list(pool.map(decode, segments)))
+    return {
+        "segments": len(segments),
+        "symbols": reader.head.value_count,
+        "first_ms": first_ms,
+        "decode_ms": one_thread_ms,
+        "two_threads_ms": two_threads_ms,
+        "slowest_segment_ms": max(each),
+    }
+
+
+def _elapsed_ms(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return 1e3 * (time.perf_counter() - start)
