@@ -1,6 +1,5 @@
 """Fixtures and settings that all tests share."""
 
-import math
 import os
 import signal
 from collections.abc import Iterator
@@ -28,18 +27,10 @@ def one_thread():
 
 @pytest.fixture
 def quick_coding(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Code with little effort, which suffices for tiny scenes: few rays, modes, passes, steps and views are tried."""
-    for constant, value in {
-        "evaluation.validation_rays.VALIDATION_RAYS": 512,
-        "rdo.curvature.RAYS": 1 << 13,
-        "rdo.codec_model.BLOCK_SIDES": (8,),
-        "rdo.codec_model.TOLERANCE": 0.05,
-        "rdo.dct_rdo.PASSES": 2,
-        "rdo.rate_search.MAX_ATTEMPTS": 6,
-        "rdo.trellis.PASSES": 2,
-    }.items():
-        monkeypatch.setattr(f"kpc.encoder.{constant}", value)
-    monkeypatch.setattr("kpc.format.scene.view_limits.STEP", math.radians(20))
+    """Code with little effort, as `quick_coding` says."""
+    import quick_coding
+
+    quick_coding.apply(monkeypatch.setattr)
 
 
 @pytest.fixture

@@ -253,8 +253,8 @@ def test_the_code_is_fitted_on_the_left_half_and_the_right_half_is_scored(
     assert code.shape == (16,) and np.abs(code).max() > 0.05
 
     class RightHalvesBlack:
-        def picture(self, n: int) -> np.ndarray:
-            out = unequal.pixels.picture(n).copy()
+        def picture(self, *rows: int | None) -> np.ndarray:
+            out = unequal.pixels.picture(*rows).copy()
             out[:, 16:] = 0
             return out
 

@@ -54,7 +54,7 @@ def test_the_diagonal_predicts_the_effect_of_small_errors(kind: str, monkeypatch
         for name, plane in scale.items():
             assert h[s][name].shape == plane.shape and h[s][name].dtype == np.float32 and (h[s][name] >= 0).all()
             moved = []
-            for _ in range(12):
+            for _ in range(8):
                 changed = dict(scale) | {name: plane + rng.normal(0, 1e-3, plane.shape).astype(np.float32)}
                 scales = (*scene.scales[:s], changed, *scene.scales[s + 1 :])
                 moved.append(
@@ -85,7 +85,7 @@ def test_the_correlation_predicts_the_effect_of_errors_in_two_channels(
             products = np.einsum("abmn,abm,abn->mn", correlation, roots, roots)
             m, n = np.unravel_index(np.abs(products).argmax(), products.shape)
             moved = []
-            for _ in range(12):
+            for _ in range(8):
                 error = rng.normal(0, 1e-3, plane.shape[:2]).astype(np.float32)
                 for sign in (1, -1):
                     changed = plane.copy()

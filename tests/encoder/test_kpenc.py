@@ -20,6 +20,7 @@ import pytest
 import torch
 
 import datasets as make
+import quick_coding
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.datasets import pixel_cache
@@ -748,10 +749,9 @@ def _failing_for(target: Path, error: BaseException) -> Callable[[Path, Path], N
 def _subprocess(argv: list[str], preparation: str) -> subprocess.Popen[str]:
     script = (
         f"import sys\n{preparation}\n"
-        "from kpc.encoder.cli import kpenc\nfrom kpc.encoder.evaluation import validation_rays\n"
-        "from kpc.encoder.rdo import curvature\nfrom kpc.encoder.field.config import PRESETS, TrainConfig\n"
-        f"PRESETS['draft'] = {TINY!r}\nvalidation_rays.VALIDATION_RAYS = 512\n"
-        f"curvature.RAYS = 1 << 13\nsys.exit(kpenc.main({argv!r}))"
+        f"sys.path.append({str(Path(quick_coding.__file__).parent)!r})\nimport quick_coding\n"
+        "from kpc.encoder.cli import kpenc\nfrom kpc.encoder.field.config import PRESETS, TrainConfig\n"
+        f"PRESETS['draft'] = {TINY!r}\nquick_coding.apply()\nsys.exit(kpenc.main({argv!r}))"
     )
     return subprocess.Popen(
         [sys.executable, "-c", script],

@@ -73,7 +73,7 @@ def test_fine_tuning_reduces_the_error_of_pictures(make: Callable[[], Scene]) ->
 
 def test_the_first_group_is_not_fine_tuned_and_only_planes_and_decoder_change() -> None:
     scene = with_motion(tiny_scene())
-    plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 20)
+    plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 40)
     assert np.array_equal(better.scales[-1]["xy"].symbols, plain.scales[-1]["xy"].symbols)
     assert not np.array_equal(better.scales[0]["xy"].symbols, plain.scales[0]["xy"].symbols)
     assert (
@@ -141,7 +141,7 @@ def test_unequal_scales_appearances_and_the_hybrid_decoder() -> None:
     narrow = replace(narrow, decoder=unpad_decoder(narrow, whole.decoder))
     assert unpad_decoder(narrow, pad_channels(narrow).decoder).w2.tobytes() == narrow.decoder.w2.tobytes()
     for scene in (narrow, with_appearances(whole), with_hybrid_decoder(whole)):
-        plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 40)
+        plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 20)
         assert error(scene, better) < error(scene, plain)
         assert [a.code.tolist() for a in better.appearances] == [a.code.tolist() for a in plain.appearances]
         scene_io.read(scene_writer.encode(better))

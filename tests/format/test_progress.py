@@ -55,6 +55,7 @@ def test_time_before_the_first_unit_is_not_extrapolated(clock: Clock, capsys: py
 def test_compiling_is_not_extrapolated(
     clock: Clock, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(CompilationMonitor, "spent_s", 0.0)
     with Progress("train", 100) as bar:
         bar.advance()
         clock.now = 42.0

@@ -1,0 +1,24 @@
+"""Coding with little effort, which suffices for tiny scenes: few rays, modes, passes, steps and views are tried."""
+
+import importlib
+import math
+from collections.abc import Callable
+
+# Constants by their full names.
+SETTINGS = {
+    "kpc.encoder.evaluation.validation_rays.VALIDATION_RAYS": 512,
+    "kpc.encoder.rdo.curvature.RAYS": 1 << 13,
+    "kpc.encoder.rdo.codec_model.BLOCK_SIDES": (8,),
+    "kpc.encoder.rdo.codec_model.TOLERANCE": 0.05,
+    "kpc.encoder.rdo.dct_rdo.PASSES": 2,
+    "kpc.encoder.rdo.rate_search.MAX_ATTEMPTS": 6,
+    "kpc.encoder.rdo.trellis.PASSES": 2,
+    "kpc.format.scene.view_limits.STEP": math.radians(20),
+}
+
+
+def apply(assign: Callable[[object, str, object], None] = setattr) -> None:
+    """Assign all settings."""
+    for name, value in SETTINGS.items():
+        module, constant = name.rsplit(".", 1)
+        assign(importlib.import_module(module), constant, value)
