@@ -1,4 +1,4 @@
-/* Section 5: what of the entropy coder is not worth inlining. */
+/* Section 5: functions of the entropy coder that need not be inlined. */
 
 #include "entropy.h"
 

@@ -15,7 +15,7 @@ from kpc.format.common.errors import FormatError
 from scenes import tiny_scene
 from without_numba import assert_same_without_numba
 
-# Of DECO: density_weight, w1, b1, w2 and b2.
+# The fields of DECO: density_weight, w1, b1, w2 and b2.
 SHAPES = [(5,), (2, 9), (2,), (3, 5, 2), (3, 5)]
 
 

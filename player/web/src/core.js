@@ -141,8 +141,8 @@ export class Core {
   #content(name, options, body, rawLength, what, details = {}) {
     const raw = this.#begin(rawLength + body.length);
     this.#put(raw + rawLength, body);
-    const told = { ...details, length: body.length, rawLength };
-    this.#run(name, [...options, raw + rawLength, body.length, raw, rawLength], what, told);
+    const named = { ...details, length: body.length, rawLength };
+    this.#run(name, [...options, raw + rawLength, body.length, raw, rawLength], what, named);
     return this.#get(raw, rawLength);
   }
 
