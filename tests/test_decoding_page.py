@@ -31,11 +31,11 @@ def test_the_example_in_python_shows_the_symbols_of_a_plane(tmp_path: Path) -> N
 
 def test_the_example_in_javascript_shows_the_planes_of_a_scene(tmp_path: Path) -> None:
     node = shutil.which("node")
-    if node is None or not (ROOT / "player" / "web" / "node_modules" / "fzstd").is_dir():
-        pytest.skip("needs node, and the packages of player/web: npm ci --prefix player/web")
+    if node is None:
+        pytest.skip("needs node")
     (tmp_path / "show.mjs").write_text(example("javascript").replace("./player", ROOT.as_uri() + "/player"))
     file = ROOT / "samples" / "default.kpc"
-    done = subprocess.run([node, "show.mjs", MODULE, file], cwd=tmp_path, capture_output=True, text=True, check=True)
+    done = subprocess.run([node, "show.mjs", file], cwd=tmp_path, capture_output=True, text=True, check=True)
     scene = read(file)
     assert done.stdout.startswith(
         f"{scene.clip.frame_count} frames at {scene.clip.fps:g} fps, {len(scene.cameras)} cam"

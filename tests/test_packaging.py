@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
@@ -28,10 +29,15 @@ def test_every_file_that_is_no_module_is_package_data() -> None:
         for file in (ROOT / floor).rglob("*"):
             if file.is_dir() or file.suffix in (".py", ".sh") or "__pycache__" in file.parts:
                 continue
-            if ROOT / "player" / "web" in file.parents:  # no part of the Python package
+            if ROOT / "player" / "web" in file.parents:  # all but the built player is no part of the Python package
                 continue
             package = "kpc." + ".".join(file.parent.relative_to(ROOT).parts)
             assert any(file.match(pattern) for pattern in data.get(package, ())), file.relative_to(ROOT)
+
+
+def test_the_built_browser_player_is_package_data() -> None:
+    assert "web/dist/*.js" in PROJECT["tool"]["setuptools"]["package-data"]["kpc.player"]
+    assert (files("kpc.player") / "web" / "dist" / "kpc-player.js").is_file()
 
 
 def test_the_repository_holds_no_symbolic_link() -> None:

@@ -5,13 +5,10 @@ const MAGIC = 0xfd2fb528;
 const LARGEST_BLOCK = 1 << 17;
 
 /**
- * Return the content of exactly one Zstandard frame (section 4.5), which must declare `length` bytes.
- * @param {Uint8Array} body
- * @param {number} length
- * @param {string} what what it holds, for messages
- * @returns {Uint8Array}
+ * Return the content of exactly one Zstandard frame (section 4.5), which must declare `length` bytes; `what` it holds
+ * is for messages.
  */
-export function unpackFrame(body, length, what) {
+export function unpackFrame(body: Uint8Array, length: number, what: string): Uint8Array {
   const invalid = new FormatError(`${what} is no valid zstd frame`);
   const frame = parseFrame(body);
   if (frame === null) throw invalid;
@@ -28,11 +25,8 @@ export function unpackFrame(body, length, what) {
   }
 }
 
-/**
- * Return what a frame declares, where it ends and how much its blocks may hold (RFC 8878); null if it is none.
- * @param {Uint8Array} body
- */
-function parseFrame(body) {
+/** Return what a frame declares, where it ends and how much its blocks may hold (RFC 8878); null if it is none. */
+function parseFrame(body: Uint8Array) {
   if (body.length < 6) return null;
   const view = new DataView(body.buffer, body.byteOffset, body.length);
   if (view.getUint32(0, true) !== MAGIC) return null;

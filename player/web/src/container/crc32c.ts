@@ -4,12 +4,8 @@ const TABLE = new Uint32Array(256).map((_, byte) => {
   return crc >>> 0;
 });
 
-/**
- * Return the CRC32C of bytes (section 3).
- * @param {Uint8Array} bytes
- * @returns {number}
- */
-export function crc32c(bytes) {
+/** Return the CRC32C of bytes (section 3). */
+export function crc32c(bytes: Uint8Array): number {
   let crc = 0xffffffff;
   for (let i = 0; i < bytes.length; i++) crc = (crc >>> 8) ^ TABLE[(crc ^ bytes[i]) & 255];
   return ~crc >>> 0;

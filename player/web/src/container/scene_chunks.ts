@@ -17,20 +17,93 @@ export const LIMIT = {
   SAMPLE: 65536,
   VALUE: 2048,
 };
-export const PLANES = ['xy', 'xz', 'yz', 'xt', 'yt', 'zt'];
-export const isTimePlane = (/** @type {string} */ name) => name.endsWith('t');
+export const PLANES = ['xy', 'xz', 'yz', 'xt', 'yt', 'zt'] as const;
+export type PlaneName = (typeof PLANES)[number];
+export const isTimePlane = (name: PlaneName): boolean => name.endsWith('t');
+
+/** What SCNE says of a plane; `step` and `offset` have a number for each channel. */
+export interface PlaneHead {
+  rows: number;
+  columns: number;
+  channels: number;
+  step: Float32Array;
+  offset: Float32Array;
+}
+
+/** The planes of a scale: six, or the three space planes of a static scene. */
+export type Scale<T> = Partial<Record<PlaneName, T>>;
+
+/** The content of SCNE; `aabb` is the lower corner and the upper one, `features` the channels of all scales. */
+export interface SceneHead {
+  aabb: number[];
+  frameCount: number;
+  fps: number;
+  rayStep: number;
+  background: number[];
+  isDynamic: boolean;
+  scales: Scale<PlaneHead>[];
+  valueCount: number;
+  features: number;
+}
+
+/** The content of WARP: contracted space (1) or device coordinates (2). */
+export type Mapping =
+  | { mapping: 1; uniformDistance: number }
+  | { mapping: 2; referencePose: number[]; near: number; baseline: number };
+
+/** The content of MOVE: displacements [t][z][y][x][3]; `sizes` are those of t, z, y and x. */
+export interface MotionGrid {
+  sizes: number[];
+  displacements: Float32Array;
+}
+
+/** The content of OCCU: one byte for each slot and cell; `sizes` are slots and cells along z, y and x. */
+export interface OccupancyGrid {
+  sizes: number[];
+  occupied: Uint8Array;
+  /** Its content under RAW, for `Core.project`. */
+  content: Uint8Array;
+}
+
+/** The content of DECO or HYBR: arrays of weights, row-major, by their names in section 6.5. */
+export interface DecoderWeights {
+  isHybrid: boolean;
+  features: number;
+  width: number;
+  hidden: number;
+  densityBias: number;
+  weights: Record<string, Float32Array>;
+}
+
+/** A camera of came; `pose` has three rows of four numbers, from the camera to the world. */
+export interface Camera {
+  width: number;
+  height: number;
+  focal: number[];
+  centre: number[];
+  pose: number[];
+}
+
+export interface Appearance {
+  name: string;
+  embedding: Float32Array;
+}
 
 /** Reads the content of a chunk from its start to its end, never beyond. */
 export class Cursor {
-  constructor(/** @type {Uint8Array} */ bytes, /** @type {string} */ kind) {
+  readonly bytes: Uint8Array;
+  readonly kind: string;
+  readonly view: DataView;
+  position = 0;
+
+  constructor(bytes: Uint8Array, kind: string) {
     this.bytes = bytes;
     this.kind = kind;
     this.view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
-    this.position = 0;
   }
 
   /** Return the position of the next `length` bytes, and move beyond them. */
-  take(/** @type {number} */ length) {
+  take(length: number) {
     const start = this.position;
     if (start + length > this.bytes.length) {
       throw new FormatError(`${this.kind}: ends after ${this.bytes.length} bytes, ${start + length} needed`);
@@ -46,12 +119,12 @@ export class Cursor {
   f64 = () => this.view.getFloat64(this.take(8), true);
 
   /** Return `count` numbers that `read` reads. */
-  many(/** @type {() => number} */ read, /** @type {number} */ count) {
+  many(read: () => number, count: number) {
     return Array.from({ length: count }, read);
   }
 
   /** Return `count` f16 as float32. */
-  halves(/** @type {number} */ count) {
+  halves(count: number) {
     const start = this.take(2 * count);
     return Float32Array.from({ length: count }, (_, k) => half(this.view.getUint16(start + 2 * k, true)));
   }
@@ -62,7 +135,7 @@ export class Cursor {
   }
 }
 
-function half(/** @type {number} */ bits) {
+function half(bits: number) {
   const sign = bits & 0x8000 ? -1 : 1;
   const exponent = (bits >> 10) & 31;
   const fraction = bits & 1023;
@@ -71,7 +144,7 @@ function half(/** @type {number} */ bits) {
 }
 
 /** SCNE (section 6.1). */
-export function parseHead(/** @type {Uint8Array} */ bytes) {
+export function parseHead(bytes: Uint8Array): SceneHead {
   const cursor = new Cursor(bytes, 'SCNE');
   const aabb = cursor.many(cursor.f32, 6);
   const frameCount = cursor.u32();
@@ -105,14 +178,11 @@ export function parseHead(/** @type {Uint8Array} */ bytes) {
     isDynamic: dynamic === 1,
     scales,
     valueCount: all.reduce((sum, plane) => sum + plane.rows * plane.columns * plane.channels, 0),
-    features: scales.reduce((sum, scale) => sum + scale.xy.channels, 0),
+    features: scales.reduce((sum, scale) => sum + (scale.xy?.channels ?? 0), 0),
   };
 }
 
-/** @typedef {{rows: number, columns: number, channels: number, step: Float32Array, offset: Float32Array}} PlaneHead */
-
-/** @returns {Record<string, PlaneHead>} */
-function parseScale(/** @type {Cursor} */ cursor, /** @type {number} */ number, /** @type {boolean} */ dynamic) {
+function parseScale(cursor: Cursor, number: number, dynamic: boolean): Scale<PlaneHead> {
   const [channels, x, y, z, t] = cursor.many(cursor.u16, 5);
   const fits = channels > 0 && channels <= LIMIT.CHANNEL && [x, y, z].every((n) => n > 0 && n <= LIMIT.AXIS);
   if (!fits || dynamic !== t > 0 || t > LIMIT.AXIS) {
@@ -120,8 +190,8 @@ function parseScale(/** @type {Cursor} */ cursor, /** @type {number} */ number, 
       `SCNE: scale ${number} claims ${channels} channels on a grid of ${x}x${y}x${z}, ${t} rows in time`,
     );
   }
-  const size = { x, y, z, t };
-  const planes = {};
+  const size: Record<string, number> = { x, y, z, t };
+  const planes: Scale<PlaneHead> = {};
   for (const name of dynamic ? PLANES : PLANES.slice(0, 3)) {
     const step = Float32Array.from(cursor.many(cursor.f32, channels));
     const offset = new Float32Array(channels).fill(1);
@@ -138,7 +208,7 @@ function parseScale(/** @type {Cursor} */ cursor, /** @type {number} */ number, 
 }
 
 /** WARP (section 6.2). */
-export function parseMapping(/** @type {Uint8Array} */ bytes, /** @type {ReturnType<typeof parseHead>} */ head) {
+export function parseMapping(bytes: Uint8Array, head: SceneHead): Mapping {
   const cursor = new Cursor(bytes, 'WARP');
   const mapping = bytes.length < 4 ? 0 : cursor.u32();
   if (mapping === 2) return parseDeviceCoordinates(cursor, head);
@@ -149,17 +219,15 @@ export function parseMapping(/** @type {Uint8Array} */ bytes, /** @type {ReturnT
   if (!(inRange && (2 * uniformDistance) / head.rayStep <= LIMIT.SAMPLE)) {
     throw new FormatError(`WARP: even steps up to a distance of ${uniformDistance} make no sense`);
   }
-  return { mapping, uniformDistance };
+  return { mapping: 1, uniformDistance };
 }
 
-function parseDeviceCoordinates(
-  /** @type {Cursor} */ cursor,
-  /** @type {ReturnType<typeof parseHead>} */ head,
-) {
+function parseDeviceCoordinates(cursor: Cursor, head: SceneHead): Mapping {
   const referencePose = cursor.many(cursor.f64, 12);
   const [near, baseline] = [cursor.f64(), cursor.f64()];
   cursor.finish();
-  const product = (i, j) => [0, 4, 8].reduce((sum, row) => sum + referencePose[row + i] * referencePose[row + j], 0);
+  const product = (i: number, j: number) =>
+    [0, 4, 8].reduce((sum, row) => sum + referencePose[row + i] * referencePose[row + j], 0);
   const pairs = [0, 1, 2].flatMap((i) => [0, 1, 2].map((j) => product(i, j) - (i === j ? 1 : 0)));
   if (
     ![near, baseline].every((x) => x >= 1 / LIMIT.BOX && x <= LIMIT.BOX) ||
@@ -173,7 +241,7 @@ function parseDeviceCoordinates(
 }
 
 /** The head of MOVE (section 6.3). */
-export function parseMotionHead(/** @type {Cursor} */ cursor, /** @type {boolean} */ isDynamic) {
+export function parseMotionHead(cursor: Cursor, isDynamic: boolean) {
   const sizes = cursor.many(cursor.u16, 4);
   const step = cursor.f32();
   const fits = sizes.every((n, axis) => n >= 2 && n <= (axis ? LIMIT.MOTION : LIMIT.AXIS));
@@ -188,7 +256,7 @@ export function parseMotionHead(/** @type {Cursor} */ cursor, /** @type {boolean
 }
 
 /** MOVE: displacements [t][z][y][x][3]. */
-export function parseMotion(/** @type {Uint8Array} */ bytes, /** @type {boolean} */ isDynamic) {
+export function parseMotion(bytes: Uint8Array, isDynamic: boolean): MotionGrid {
   const cursor = new Cursor(bytes, 'MOVE');
   const { sizes, step, count } = parseMotionHead(cursor, isDynamic);
   const start = cursor.take(2 * count);
@@ -199,7 +267,7 @@ export function parseMotion(/** @type {Uint8Array} */ bytes, /** @type {boolean}
 }
 
 /** The head of OCCU (section 6.4): slots and cells along z, y, x. */
-export function parseOccupancyHead(/** @type {Cursor} */ cursor) {
+export function parseOccupancyHead(cursor: Cursor) {
   const sizes = cursor.many(cursor.u16, 4);
   if (!sizes.every((n) => n > 0 && n <= LIMIT.AXIS)) {
     throw new FormatError(`OCCU: a grid of ${sizes} cells makes no sense`);
@@ -208,12 +276,12 @@ export function parseOccupancyHead(/** @type {Cursor} */ cursor) {
 }
 
 /** OCCU: one byte for each slot and cell; `content` is for `Core.project`. */
-export function parseOccupancy(/** @type {Uint8Array} */ content) {
+export function parseOccupancy(content: Uint8Array): OccupancyGrid {
   const cursor = new Cursor(content, 'OCCU');
   const { sizes, cells } = parseOccupancyHead(cursor);
   const start = cursor.take(Math.ceil(cells / 8));
   cursor.finish();
-  if (cells % 8 && content[content.length - 1] >> cells % 8) {
+  if (cells % 8 && content[content.length - 1] >> (cells % 8)) {
     throw new FormatError('OCCU: the unused bits of its last byte are not 0');
   }
   const occupied = new Uint8Array(cells);
@@ -222,7 +290,7 @@ export function parseOccupancy(/** @type {Uint8Array} */ content) {
 }
 
 /** The arrays of DECO or HYBR (section 6.5) by their names, in order, with their lengths. */
-function arrayLengths(isHybrid, features, width, hidden) {
+function arrayLengths(isHybrid: boolean, features: number, width: number, hidden: number): Record<string, number> {
   return isHybrid
     ? {
         ...{ v: width * features, v_bias: width, density_weight: width, w1: 9 * hidden, b1: hidden },
@@ -232,7 +300,7 @@ function arrayLengths(isHybrid, features, width, hidden) {
 }
 
 /** The head of DECO or HYBR. */
-export function parseDecoderHead(/** @type {Cursor} */ cursor, /** @type {number} */ expected) {
+export function parseDecoderHead(cursor: Cursor, expected: number) {
   const isHybrid = cursor.kind === 'HYBR';
   const features = cursor.u16();
   const width = isHybrid ? cursor.u16() : 0;
@@ -253,10 +321,10 @@ export function parseDecoderHead(/** @type {Cursor} */ cursor, /** @type {number
 }
 
 /** DECO or HYBR: arrays of weights by their names in the spec. */
-export function parseDecoder(/** @type {Uint8Array} */ bytes, /** @type {string} */ kind, /** @type {number} */ expected) {
+export function parseDecoder(bytes: Uint8Array, kind: string, expected: number): DecoderWeights {
   const cursor = new Cursor(bytes, kind);
-  const { lengths, ...head } = parseDecoderHead(cursor, expected);
-  const weights = {};
+  const { lengths, rawLength: _, ...head } = parseDecoderHead(cursor, expected);
+  const weights: Record<string, Float32Array> = {};
   for (const [name, length] of Object.entries(lengths)) weights[name] = cursor.halves(length);
   cursor.finish();
   if (!Object.values(weights).every((array) => array.every(Number.isFinite))) {
@@ -266,13 +334,13 @@ export function parseDecoder(/** @type {Uint8Array} */ bytes, /** @type {string}
 }
 
 /** Whether the axes of a pose, rows of 4 numbers, have about the length 1, as files must have them; or NaN. */
-export function hasUnitAxes(/** @type {ArrayLike<number>} */ pose) {
+export function hasUnitAxes(pose: ArrayLike<number>): boolean {
   const lengths = [0, 1, 2].map((axis) => Math.hypot(pose[axis], pose[axis + 4], pose[axis + 8]));
   return !(Math.min(...lengths) < 0.5 || Math.max(...lengths) > 2);
 }
 
 /** came (section 6.6). */
-export function parseCameras(/** @type {Uint8Array} */ bytes) {
+export function parseCameras(bytes: Uint8Array): Camera[] {
   const cursor = new Cursor(bytes, 'came');
   const count = cursor.u16();
   if (count < 1 || count > LIMIT.CAMERA) throw new FormatError(`came: ${count} cameras (1 to ${LIMIT.CAMERA} allowed)`);
@@ -294,7 +362,7 @@ export function parseCameras(/** @type {Uint8Array} */ bytes) {
 }
 
 /** appe (section 6.7). */
-export function parseAppearances(/** @type {Uint8Array} */ bytes, /** @type {number} */ expected) {
+export function parseAppearances(bytes: Uint8Array, expected: number): Appearance[] {
   const cursor = new Cursor(bytes, 'appe');
   const [count, hidden] = [cursor.u16(), cursor.u16()];
   if (count < 1 || count > LIMIT.APPEARANCE || hidden !== expected) {

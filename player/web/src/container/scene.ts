@@ -1,13 +1,22 @@
 /** A scene in a .kpc file: which chunks it needs, and what they hold (sections 4.3, 6, 7 and 10 of the spec). */
 
-import { CODEC, Container, isCritical } from './container.js';
+import type { Core, SegmentSymbols } from '../decoder/core.js';
+import { CODEC, Container, type ContainerOptions, type Entry, isCritical } from './container.js';
 import { BudgetError, FormatError } from './errors.js';
-import { META_LIMIT, parseMetadata } from './metadata.js';
+import { META_LIMIT, type Metadata, parseMetadata } from './metadata.js';
 import {
+  type Appearance,
+  type Camera,
   Cursor,
-  LIMIT,
-  PLANES,
+  type DecoderWeights,
   isTimePlane,
+  LIMIT,
+  type Mapping,
+  type MotionGrid,
+  type OccupancyGrid,
+  PLANES,
+  type PlaneHead,
+  type PlaneName,
   parseAppearances,
   parseCameras,
   parseDecoder,
@@ -18,27 +27,35 @@ import {
   parseMotionHead,
   parseOccupancy,
   parseOccupancyHead,
+  type Scale,
+  type SceneHead,
 } from './scene_chunks.js';
-
-/** @typedef {import('./container.js').Entry} Entry */
-/** @typedef {import('./core.js').Core} Core */
 
 const KNOWN_KINDS = ['SCNE', 'WARP', 'MOVE', 'DECO', 'HYBR', 'OCCU', 'came', 'appe', 'meta', 'PLNE'];
 const HEAD_LIMIT = 58 + LIMIT.SCALE * (10 + 9 * 4 * LIMIT.CHANNEL);
-const AXIS_OF = { t: 0, z: 1, y: 2, x: 3 };
+const AXIS_OF: Record<string, number> = { t: 0, z: 1, y: 2, x: 3 };
+
+export interface SceneOptions extends ContainerOptions {
+  /** Bytes that the scene may take. */
+  memoryBudget?: number;
+}
+
+/** A plane of a file of which all or some rows are there; the values of the others come from `offset` alone. */
+export interface PlaneSymbols extends SegmentSymbols {
+  head: PlaneHead;
+  offset: Float32Array;
+}
 
 /** Random access to the parts of a scene. Opening one checks that the index lists all that a scene needs. */
 export class Scene {
-  /** @type {Map<string, any>} */
-  #decoded = new Map();
+  readonly container: Container;
+  readonly head: SceneHead;
+  readonly core: Core;
+  readonly memoryBudget: number;
+  readonly #decoded = new Map<string, unknown>();
 
-  /**
-   * @param {Uint8Array} bytes of the file
-   * @param {Core} core
-   * @param {{allowPartial?: boolean, memoryBudget?: number}} [options]
-   */
-  constructor(bytes, core, { allowPartial = false, memoryBudget = 2 ** 31 } = {}) {
-    this.container = new Container(bytes, { allowPartial });
+  constructor(bytes: Uint8Array, core: Core, options: SceneOptions = {}) {
+    this.container = new Container(bytes, options);
     this.core = core;
     this.#checkKinds();
     this.head = parseHead(this.container.content(this.#only('SCNE'), HEAD_LIMIT));
@@ -46,7 +63,7 @@ export class Scene {
     if (this.head.valueCount !== valueCount) {
       throw new FormatError(`the header claims ${valueCount} values, the scene ${this.head.valueCount}`);
     }
-    this.memoryBudget = memoryBudget;
+    this.memoryBudget = options.memoryBudget ?? 2 ** 31;
     this.#afford(0, 'its planes');
     this.#checkSegments();
     this.#decoderNumber();
@@ -54,12 +71,12 @@ export class Scene {
   }
 
   /** The mapping of space; null if the box bounds the scene. */
-  get mapping() {
+  get mapping(): Mapping | null {
     return this.#once('WARP', (number) => parseMapping(this.container.content(number, 116), this.head));
   }
 
   /** The motion grid; null if there is none. */
-  get motion() {
+  get motion(): MotionGrid | null {
     return this.#once('MOVE', (number, entry) => {
       this.#afford(8 * entry.rawLength, 'its motion grid');
       if (entry.codec !== CODEC.MOTION) return parseMotion(this.container.content(number), this.head.isDynamic);
@@ -71,8 +88,8 @@ export class Scene {
   }
 
   /** The occupancy grid. */
-  get occupancy() {
-    return this.#once('OCCU', (number, entry) => {
+  get occupancy(): OccupancyGrid {
+    return this.#held('OCCU', (number, entry) => {
       this.#afford(8 * entry.rawLength, 'its occupancy grid');
       if (entry.codec !== CODEC.OCCUPANCY) return parseOccupancy(this.container.content(number));
       const body = this.container.coded(number);
@@ -83,9 +100,9 @@ export class Scene {
   }
 
   /** The weights of the decoder, DECO or HYBR. */
-  get decoder() {
+  get decoder(): DecoderWeights {
     const kind = this.container.index[this.#decoderNumber()].kind;
-    return this.#once(kind, (number, entry) => {
+    return this.#held(kind, (number, entry) => {
       if (entry.codec !== CODEC.WEIGHTS) {
         const most = 10 + 2 * (LIMIT.HIDDEN + 3) * (4 * this.head.features + 2 * LIMIT.HIDDEN + 16);
         return parseDecoder(this.container.content(number, most), kind, this.head.features);
@@ -100,7 +117,7 @@ export class Scene {
   }
 
   /** The cameras; none if the file has, or has yet, no such chunk. */
-  get cameras() {
+  get cameras(): Camera[] {
     const found = this.#once('came', (number, entry) => {
       if (entry.codec !== CODEC.POSES) return parseCameras(this.container.content(number, 2 + 68 * LIMIT.CAMERA));
       return parseCameras(this.core.poses(this.container.coded(number), entry.rawLength));
@@ -109,7 +126,7 @@ export class Scene {
   }
 
   /** The appearances; none if the file has, or has yet, no such chunk. */
-  get appearances() {
+  get appearances(): Appearance[] {
     const found = this.#once('appe', (number, entry) => {
       const { hidden } = this.decoder;
       this.#afford(4 * entry.rawLength, 'its appearances');
@@ -120,23 +137,23 @@ export class Scene {
   }
 
   /** The metadata; an empty object if the file has, or has yet, no such chunk. */
-  get metadata() {
+  get metadata(): Metadata {
     return this.#once('meta', (number) => parseMetadata(this.container.content(number, META_LIMIT))) ?? {};
   }
 
   /** Return what SCNE says of the plane that a PLNE chunk is a segment of, and the name of the plane. */
-  planeOf(/** @type {Entry} */ entry) {
-    const name = PLANES[entry.plane];
-    return { name, plane: this.head.scales[entry.scale][name] };
+  planeOf(entry: Entry): { name: PlaneName; plane: PlaneHead } {
+    const name = PLANES[entry.plane] as PlaneName;
+    return { name, plane: this.head.scales[entry.scale]?.[name] as PlaneHead };
   }
 
   /** Decode a PLNE chunk: symbols and coded texels of its rows. */
-  segment(/** @type {number} */ number) {
+  segment(number: number): SegmentSymbols {
     const entry = this.container.index[number];
     const { name, plane } = this.planeOf(entry);
     const { rows, columns, channels } = plane;
     const texels = entry.rowCount * columns;
-    const sizes = [entry.rowCount, columns, channels];
+    const sizes = [entry.rowCount, columns, channels] as const;
     if (entry.codec !== CODEC.PREDICTIVE && entry.codec !== CODEC.TRANSFORM) {
       const content = this.container.content(number, 1 + Math.ceil(texels / 8) + channels * texels);
       return this.core.segment(CODEC.RAW, content, ...sizes);
@@ -151,72 +168,80 @@ export class Scene {
     return this.core.segment(entry.codec, body, ...sizes, map);
   }
 
-  /**
-   * Decode all planes, of which rows that are not there count as section 10 says.
-   * @returns {Record<string, {head: any, symbols: Int8Array, coded: Uint8Array, offset: Float32Array}>[]}
-   */
-  planes() {
-    const found = this.head.scales.map((scale) =>
-      Object.fromEntries(
-        Object.entries(scale).map(([name, head]) => {
-          const texels = head.rows * head.columns;
-          const offset = isTimePlane(name) ? head.offset : new Float32Array(head.channels);
-          return [name, { head, symbols: new Int8Array(texels * head.channels), coded: new Uint8Array(texels), offset }];
-        }),
-      ),
-    );
+  /** Decode all planes, of which rows that are not there count as section 10 says. */
+  planes(): Scale<PlaneSymbols>[] {
+    const found: Scale<PlaneSymbols>[] = this.head.scales.map((scale) => {
+      const planes: Scale<PlaneSymbols> = {};
+      for (const name of PLANES) {
+        const head = scale[name];
+        if (head === undefined) continue;
+        const texels = head.rows * head.columns;
+        const offset = isTimePlane(name) ? head.offset : new Float32Array(head.channels);
+        planes[name] = { head, symbols: new Int8Array(texels * head.channels), coded: new Uint8Array(texels), offset };
+      }
+      return planes;
+    });
     for (const [number, entry] of this.container.index.entries()) {
       if (entry.kind !== 'PLNE' || !this.container.available(number)) continue;
       const { name, plane } = this.planeOf(entry);
       const { symbols, coded } = this.segment(number);
       const first = entry.rowStart * plane.columns;
-      found[entry.scale][name].symbols.set(symbols, first * plane.channels);
-      found[entry.scale][name].coded.set(coded, first);
-      found[entry.scale][name].offset = plane.offset;
+      const into = found[entry.scale]?.[name] as PlaneSymbols;
+      into.symbols.set(symbols, first * plane.channels);
+      into.coded.set(coded, first);
+      into.offset = plane.offset;
     }
     return found;
   }
 
-  #impliedMap(name, rows, columns, entry) {
+  #impliedMap(name: PlaneName, rows: number, columns: number, entry: Entry): Uint8Array {
     const { sizes, content } = this.occupancy;
     const cells = [sizes[AXIS_OF[name[1]]], sizes[AXIS_OF[name[0]]]];
     if (!this.#decoded.has(name)) {
       this.#decoded.set(name, this.core.project(content, entry.plane, cells[0] * cells[1]));
     }
-    return this.core.impliedMap(this.#decoded.get(name), cells, rows, columns, entry.rowStart, entry.rowCount);
+    const projected = this.#decoded.get(name) as Uint8Array;
+    return this.core.impliedMap(projected, cells, rows, columns, entry.rowStart, entry.rowCount);
   }
 
   /** Return what `parse` makes of the one chunk of a kind, the first time; null if there is none, or not yet. */
-  #once(/** @type {string} */ kind, /** @type {(number: number, entry: Entry) => any} */ parse) {
+  #once<T>(kind: string, parse: (number: number, entry: Entry) => T): T | null {
     if (!this.#decoded.has(kind)) {
       const number = this.container.index.some((entry) => entry.kind === kind) ? this.#only(kind) : -1;
       const isHeld = number >= 0 && (kind[0] < 'a' || this.container.available(number));
       this.#decoded.set(kind, isHeld ? parse(number, this.container.index[number]) : null);
     }
-    return this.#decoded.get(kind);
+    return this.#decoded.get(kind) as T | null;
   }
 
-  #checkClaim(kind, entry, length) {
+  /** Return the same of a kind that every scene has. */
+  #held<T>(kind: string, parse: (number: number, entry: Entry) => T): T {
+    return this.#once(kind, parse) as T;
+  }
+
+  #checkClaim(kind: string, entry: Entry, length: number): void {
     if (entry.rawLength !== length) {
       throw new FormatError(`${kind}: claims ${entry.rawLength} bytes, not those of its sizes`);
     }
   }
 
-  #afford(/** @type {number} */ more, /** @type {string} */ what) {
+  #afford(more: number, what: string): void {
     const needed = 5 * this.head.valueCount + more;
     if (needed > this.memoryBudget) {
-      throw new BudgetError(`needs ${needed} bytes of memory with ${what}, more than the budget of ${this.memoryBudget}`);
+      throw new BudgetError(
+        `needs ${needed} bytes of memory with ${what}, more than the budget of ${this.memoryBudget}`,
+      );
     }
   }
 
   /** Return the number of the one chunk of a kind. */
-  #only(/** @type {string} */ kind) {
+  #only(kind: string): number {
     const found = [...this.container.index.keys()].filter((number) => this.container.index[number].kind === kind);
     if (found.length !== 1) throw new FormatError(`holds ${found.length} ${kind} chunks, not one`);
     return found[0];
   }
 
-  #decoderNumber() {
+  #decoderNumber(): number {
     const kinds = this.container.index.map((entry) => entry.kind);
     if (kinds.includes('DECO') && kinds.includes('HYBR')) throw new FormatError('holds two decoders, DECO and HYBR');
     return this.#only(kinds.includes('HYBR') ? 'HYBR' : 'DECO');
@@ -237,14 +262,17 @@ export class Scene {
   /** Check that every plane is listed whole: its segments neither overlap nor leave a gap. */
   #checkSegments() {
     const names = this.head.isDynamic ? PLANES : PLANES.slice(0, 3);
-    /** @type {Map<string, Entry[]>} */
-    const found = new Map(this.head.scales.flatMap((_, s) => names.map((__, p) => [`${s} ${p}`, []])));
+    const found = new Map<string, Entry[]>(
+      this.head.scales.flatMap((_, s) => names.map((__, p) => [`${s} ${p}`, []] as [string, Entry[]])),
+    );
     for (const [number, entry] of this.container.index.entries()) {
       const { group, scale, plane, rowStart, rowCount } = entry;
       if (entry.kind === 'PLNE') {
         const segments = found.get(`${scale} ${plane}`);
         if (group !== 0 || segments === undefined) {
-          throw new FormatError(`chunk ${number} belongs to group ${group}, scale ${scale}, plane ${plane}, which is not`);
+          throw new FormatError(
+            `chunk ${number} belongs to group ${group}, scale ${scale}, plane ${plane}, which is not`,
+          );
         }
         segments.push(entry);
       } else if (KNOWN_KINDS.includes(entry.kind) && (group || scale || plane || rowStart || rowCount)) {
@@ -253,17 +281,13 @@ export class Scene {
     }
     for (const [key, segments] of found) {
       const [scale, plane] = key.split(' ').map(Number);
-      checkRows(segments, this.head.scales[scale][names[plane]].rows, `scale ${scale}, plane ${names[plane]}`, plane < 3);
+      const { rows } = this.head.scales[scale][names[plane]] as PlaneHead;
+      checkRows(segments, rows, `scale ${scale}, plane ${names[plane]}`, plane < 3);
     }
   }
 }
 
-function checkRows(
-  /** @type {Entry[]} */ segments,
-  /** @type {number} */ rows,
-  /** @type {string} */ where,
-  /** @type {boolean} */ isSpacePlane,
-) {
+function checkRows(segments: Entry[], rows: number, where: string, isSpacePlane: boolean): void {
   if (isSpacePlane && segments.length > 1) {
     throw new FormatError(`${where}: a space plane is one segment, not ${segments.length}`);
   }

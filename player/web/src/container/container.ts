@@ -7,7 +7,7 @@ import { crc32c } from './crc32c.js';
 import { FormatError } from './errors.js';
 import { unpackFrame } from './zstd.js';
 
-export const MAGIC = [0x89, 0x4b, 0x50, 0x43, 0x0d, 0x0a, 0x1a, 0x0a];
+export const MAGIC: readonly number[] = [0x89, 0x4b, 0x50, 0x43, 0x0d, 0x0a, 0x1a, 0x0a];
 export const VERSION = 1;
 export const HEADER_LENGTH = 48;
 export const ENTRY_LENGTH = 30;
@@ -15,56 +15,77 @@ export const EXPANSION_LIMIT = 32768;
 export const CHUNK_LIMIT = 1 << 16;
 export const CODEC = { RAW: 0, ZSTD: 1, PREDICTIVE: 2, TRANSFORM: 3, MOTION: 4, OCCUPANCY: 5, WEIGHTS: 6, POSES: 7 };
 
-/**
- * @typedef {object} Entry a chunk, as the index lists it; `offset` is its position in the file
- * @property {string} kind
- * @property {number} group
- * @property {number} scale
- * @property {number} plane
- * @property {number} rowStart
- * @property {number} rowCount
- * @property {number} codec
- * @property {number} storedLength
- * @property {number} rawLength
- * @property {number} crc
- * @property {number} offset
- */
+/** A chunk, as the index lists it; `offset` is its position in the file. */
+export interface Entry {
+  kind: string;
+  group: number;
+  scale: number;
+  plane: number;
+  rowStart: number;
+  rowCount: number;
+  codec: number;
+  storedLength: number;
+  rawLength: number;
+  crc: number;
+  offset: number;
+}
+
+/** What the header says (section 4.1). */
+export interface Header {
+  chunkCount: number;
+  indexLength: number;
+  indexCrc: number;
+  fileLength: number;
+  valueCount: number;
+  largestRaw: number;
+}
+
+export interface ContainerOptions {
+  /** Whether the end of the file may be missing. */
+  allowPartial?: boolean;
+  /** Stored chunks beyond the bytes that are given, by their numbers. */
+  bodies?: ReadonlyMap<number, Uint8Array>;
+}
 
 /** Whether a reader must know the kind of a chunk (section 4.3). */
-export const isCritical = (/** @type {Entry} */ entry) => entry.kind[0] < 'a';
+export const isCritical = (entry: Entry) => entry.kind[0] < 'a';
 
-/** Random access to the chunks of a file that is in memory, whole or, if `allowPartial`, its beginning. */
+/**
+ * Random access to the chunks of a file that is in memory: whole or, if `allowPartial`, its beginning, and chunks that
+ * were fetched besides.
+ */
 export class Container {
-  /**
-   * @param {Uint8Array} bytes
-   * @param {{allowPartial?: boolean}} [options]
-   */
-  constructor(bytes, { allowPartial = false } = {}) {
+  readonly header: Header;
+  readonly index: readonly Entry[];
+  readonly bytes: Uint8Array;
+  readonly #bodies: ReadonlyMap<number, Uint8Array>;
+
+  constructor(bytes: Uint8Array, { allowPartial = false, bodies = new Map() }: ContainerOptions = {}) {
     this.bytes = bytes;
+    this.#bodies = bodies;
     this.header = readHeader(bytes, allowPartial);
-    /** @type {Entry[]} */
     this.index = readIndex(bytes, this.header);
   }
 
   /** Whether all bytes of a chunk are there. */
-  available(/** @type {number} */ number) {
+  available(number: number) {
     const entry = this.index[number];
-    return entry.offset + entry.storedLength <= this.bytes.length;
+    return entry.offset + entry.storedLength <= this.bytes.length || this.#bodies.get(number) !== undefined;
   }
 
   /** Return a chunk as it lies in the file, its CRC32C verified. */
-  stored(/** @type {number} */ number) {
+  stored(number: number) {
     const entry = this.index[number];
     if (!this.available(number)) throw new FormatError(`cut off: ${this.label(number)} is not there`);
-    const body = this.bytes.subarray(entry.offset, entry.offset + entry.storedLength);
-    if (crc32c(body) !== entry.crc) {
+    const body = this.#bodies.get(number) ?? this.bytes.subarray(entry.offset, entry.offset + entry.storedLength);
+    if (body.length !== entry.storedLength || crc32c(body) !== entry.crc) {
       throw new FormatError(`${this.label(number)} is damaged (its CRC32C differs); fetch the file again`);
     }
     return body;
   }
 
   /** Return the content of a chunk under RAW or ZSTD, of at most `limit` bytes. */
-  content(/** @type {number} */ number, limit = Infinity) {
+  content(number: number, limit = Infinity) {
     const entry = this.index[number];
     if (entry.rawLength > limit) {
       throw new FormatError(`${this.label(number)} claims ${entry.rawLength} bytes where at most ${limit} make sense`);
@@ -75,13 +96,15 @@ export class Container {
       throw new FormatError(`${this.label(number)} uses codec ${entry.codec}, unknown to this reader; update kpc`);
     }
     if (content.length !== entry.rawLength) {
-      throw new FormatError(`${this.label(number)} holds ${content.length} bytes, not the ${entry.rawLength} it claims`);
+      throw new FormatError(
+        `${this.label(number)} holds ${content.length} bytes, not the ${entry.rawLength} it claims`,
+      );
     }
     return content;
   }
 
   /** Return a chunk under one of the codecs from PREDICTIVE on as it is stored, if it may hold what it claims. */
-  coded(/** @type {number} */ number) {
+  coded(number: number) {
     const entry = this.index[number];
     if (entry.rawLength > entry.storedLength * EXPANSION_LIMIT) {
       throw new FormatError(
@@ -92,13 +115,13 @@ export class Container {
   }
 
   /** Return the name of a chunk in messages. */
-  label(/** @type {number} */ number) {
+  label(number: number) {
     return `chunk ${number} (${this.index[number].kind})`;
   }
 }
 
 /** Read and check the header (section 4.1). */
-function readHeader(/** @type {Uint8Array} */ bytes, /** @type {boolean} */ allowPartial) {
+export function readHeader(bytes: Uint8Array, allowPartial: boolean): Header {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
   if (bytes.length === 0 || MAGIC.some((byte, k) => k < bytes.length && bytes[k] !== byte)) {
     throw new FormatError('not a .kpc file');
@@ -129,12 +152,8 @@ function readHeader(/** @type {Uint8Array} */ bytes, /** @type {boolean} */ allo
   return header;
 }
 
-function checkSizes(
-  /** @type {{chunkCount: number, indexLength: number, fileLength: number, valueCount: number, largestRaw: number}} */
-  { chunkCount, indexLength, fileLength, valueCount, largestRaw },
-  /** @type {number} */ size,
-  /** @type {boolean} */ allowPartial,
-) {
+function checkSizes(header: Header, size: number, allowPartial: boolean): void {
+  const { chunkCount, indexLength, fileLength, valueCount, largestRaw } = header;
   const least = HEADER_LENGTH + Math.max(indexLength, 8 * chunkCount);
   const countFits = chunkCount > 0 && chunkCount <= CHUNK_LIMIT;
   if (!countFits || indexLength === 0 || indexLength > 64 + 40 * chunkCount || fileLength < least) {
@@ -152,11 +171,8 @@ function checkSizes(
 }
 
 /** Read and check the index (section 4.2). */
-function readIndex(
-  /** @type {Uint8Array} */ bytes,
-  /** @type {{chunkCount: number, indexLength: number, indexCrc: number, fileLength: number, largestRaw: number}} */
-  { chunkCount, indexLength, indexCrc, fileLength, largestRaw },
-) {
+function readIndex(bytes: Uint8Array, header: Header): Entry[] {
+  const { chunkCount, indexLength, indexCrc, fileLength, largestRaw } = header;
   if (bytes.length < HEADER_LENGTH + indexLength) throw new FormatError('cut off within the chunk index');
   const index = bytes.subarray(HEADER_LENGTH, HEADER_LENGTH + indexLength);
   if (crc32c(index) !== indexCrc) {
@@ -165,7 +181,7 @@ function readIndex(
   const table = unpackFrame(index, ENTRY_LENGTH * chunkCount, 'chunk index');
   const row = new Uint8Array(ENTRY_LENGTH);
   const view = new DataView(row.buffer);
-  const entries = [];
+  const entries: Entry[] = [];
   let offset = HEADER_LENGTH + indexLength;
   for (let number = 0; number < chunkCount; number++) {
     for (let k = 0; k < ENTRY_LENGTH; k++) row[k] = table[k * chunkCount + number];

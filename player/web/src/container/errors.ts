@@ -1,9 +1,9 @@
 /** A .kpc file is damaged, hostile or of an unsupported version. */
 export class FormatError extends Error {
-  name = 'FormatError';
+  override name = 'FormatError';
 }
 
 /** Reading a .kpc file would need more memory than the reader was given. */
 export class BudgetError extends FormatError {
-  name = 'BudgetError';
+  override name = 'BudgetError';
 }

@@ -3,7 +3,7 @@
  * memory of the module only while it runs; all results are copies.
  */
 
-import { BudgetError, FormatError } from './errors.js';
+import { BudgetError, FormatError } from '../container/errors.js';
 
 /** Memory that the core takes for itself, at most: its tables, and rows of what it keeps of a segment. */
 const CORE_BYTES = 32 << 20;
@@ -11,7 +11,8 @@ const ADDRESSES = 0xffff0000;
 const NO_MEMORY = 1;
 
 /** What the values of `Status` in kpc_core.h mean, with the details that callers give. */
-const MESSAGES = {
+type Details = Record<string, number>;
+const MESSAGES: Record<number, (details: Details) => string> = {
   2: () => 'its sizes are beyond the limits of the format',
   3: () => 'cut off within its words',
   4: () => 'its first state is too small',
@@ -32,34 +33,45 @@ const MESSAGES = {
   19: (d) => `claims ${d.rawLength} bytes, not those of its sizes`,
   20: () => 'cut off within its head',
   21: (d) => `${d.count} cameras (1 to 4096 allowed)`,
-  22: (d) =>
-    `${d.lenses} lenses of ${d.count} cameras, or positions in multiples of 2^${d.exponent}, make no sense`,
+  22: (d) => `${d.lenses} lenses of ${d.count} cameras, or positions in multiples of 2^${d.exponent}, make no sense`,
   23: (d) => `${d.length} bytes are not those of ${d.count} cameras and ${d.lenses} lenses`,
   24: () => 'a rotation or a position is out of range',
 };
 
+interface Exports {
+  memory: WebAssembly.Memory;
+  kpc_begin(most: number, bytes: number): number;
+  [name: string]: unknown;
+}
+
+/** The numbers of a plane segment: symbols [rows][columns][channels], and a byte for each texel, whether it is coded. */
+export interface SegmentSymbols {
+  symbols: Int8Array<ArrayBuffer>;
+  coded: Uint8Array<ArrayBuffer>;
+}
+
 export class Core {
-  /**
-   * @param {WebAssembly.Module} module
-   * @param {number} memoryLimit bytes that a call may take beside CORE_BYTES
-   */
-  constructor(module, memoryLimit = 2 ** 31) {
+  readonly limit: number;
+  readonly #exports: Exports;
+
+  /** Make an instance of a module, of whose calls each may take `memoryLimit` bytes beside CORE_BYTES. */
+  constructor(module: WebAssembly.Module, memoryLimit = 2 ** 31) {
     this.limit = Math.min(memoryLimit + CORE_BYTES, ADDRESSES);
-    /** @type {any} */
-    this.exports = new WebAssembly.Instance(module).exports;
+    this.#exports = new WebAssembly.Instance(module).exports as unknown as Exports;
   }
 
   /**
-   * Decode a plane segment (section 7) under any codec.
-   * @param {number} codec
-   * @param {Uint8Array} body of ZSTD, what the frame holds
-   * @param {number} rows
-   * @param {number} columns
-   * @param {number} channels
-   * @param {Uint8Array | null} implied the implied map, where the body needs it
-   * @returns {{symbols: Int8Array, coded: Uint8Array}} [rows][columns][channels] and [rows][columns]
+   * Decode a plane segment (section 7) under any codec; `body` is of ZSTD what the frame holds, and `implied` the
+   * implied map where the body needs it.
    */
-  segment(codec, body, rows, columns, channels, implied = null) {
+  segment(
+    codec: number,
+    body: Uint8Array,
+    rows: number,
+    columns: number,
+    channels: number,
+    implied: Uint8Array | null = null,
+  ): SegmentSymbols {
     const texels = rows * columns;
     const values = texels * channels;
     const coded = this.#begin(texels + values + body.length);
@@ -73,29 +85,29 @@ export class Core {
   }
 
   /** Decode MOVE under MOTION (section 8.1) to its content under RAW. */
-  motion(/** @type {Uint8Array} */ body, /** @type {number} */ rawLength) {
+  motion(body: Uint8Array, rawLength: number): Uint8Array {
     return this.#content('kpc_motion', [], body, rawLength, 'motion');
   }
 
   /** Decode OCCU under OCCUPANCY (section 8.2) to its content under RAW. */
-  occupancy(/** @type {Uint8Array} */ body, /** @type {number} */ rawLength) {
+  occupancy(body: Uint8Array, rawLength: number): Uint8Array {
     return this.#content('kpc_occupancy', [], body, rawLength, 'occupancy');
   }
 
   /** Decode DECO, or HYBR, under WEIGHTS (section 8.3) to its content under RAW. */
-  weights(/** @type {boolean} */ isHybrid, /** @type {Uint8Array} */ body, /** @type {number} */ rawLength) {
+  weights(isHybrid: boolean, body: Uint8Array, rawLength: number): Uint8Array {
     return this.#content('kpc_weights', [isHybrid ? 1 : 0], body, rawLength, 'weights');
   }
 
   /** Decode came under POSES (section 8.4) to its content under RAW. */
-  poses(/** @type {Uint8Array} */ body, /** @type {number} */ rawLength) {
+  poses(body: Uint8Array, rawLength: number): Uint8Array {
     const [count, lenses] = [0, 2].map((at) => body[at] | (body[at + 1] << 8));
     const details = { count, lenses, exponent: (body[4] << 24) >> 24 };
     return this.#content('kpc_poses', [], body, rawLength, 'came', details);
   }
 
   /** Project an occupancy grid, the content of OCCU under RAW, onto a plane (section 7.2): one byte for each cell. */
-  project(/** @type {Uint8Array} */ occupancy, /** @type {number} */ plane, /** @type {number} */ cells) {
+  project(occupancy: Uint8Array, plane: number, cells: number): Uint8Array {
     const projected = this.#begin(cells + occupancy.length);
     this.#put(projected + cells, occupancy);
     this.#run('kpc_project', [projected + cells, occupancy.length, plane, projected], 'occupancy', {});
@@ -103,15 +115,17 @@ export class Core {
   }
 
   /**
-   * Return rows of the implied map (section 7.2) of a plane: one byte for each texel.
-   * @param {Uint8Array} projected of `project`
-   * @param {number[]} cells how many along rows and columns
-   * @param {number} rows of the plane
-   * @param {number} columns
-   * @param {number} rowStart
-   * @param {number} rowCount
+   * Return rows of the implied map (section 7.2) of a plane of `rows` and `columns`: one byte for each texel.
+   * `projected` is what `project` returns, `cells` how many there are along rows and columns.
    */
-  impliedMap(projected, cells, rows, columns, rowStart, rowCount) {
+  impliedMap(
+    projected: Uint8Array,
+    cells: readonly number[],
+    rows: number,
+    columns: number,
+    rowStart: number,
+    rowCount: number,
+  ): Uint8Array {
     const texels = rowCount * columns;
     const coded = this.#begin(texels + projected.length);
     this.#put(coded + texels, projected);
@@ -119,13 +133,8 @@ export class Core {
     return this.#get(coded, texels);
   }
 
-  /**
-   * Return the float32 values of symbols (section 7.6).
-   * @param {Int8Array} symbols
-   * @param {Float32Array} step of each channel
-   * @param {Float32Array} offset
-   */
-  dequantise(symbols, step, offset) {
+  /** Return the float32 values of symbols (section 7.6); `step` and `offset` have a number for each channel. */
+  dequantise(symbols: Int8Array, step: Float32Array, offset: Float32Array): Float32Array {
     const channels = step.length;
     const values = this.#begin(5 * symbols.length + 8 * channels);
     const steps = values + 4 * symbols.length;
@@ -138,7 +147,14 @@ export class Core {
     return new Float32Array(this.#get(values, 4 * symbols.length).buffer);
   }
 
-  #content(name, options, body, rawLength, what, details = {}) {
+  #content(
+    name: string,
+    options: number[],
+    body: Uint8Array,
+    rawLength: number,
+    what: string,
+    details: Details = {},
+  ): Uint8Array {
     const raw = this.#begin(rawLength + body.length);
     this.#put(raw + rawLength, body);
     const named = { ...details, length: body.length, rawLength };
@@ -147,23 +163,23 @@ export class Core {
   }
 
   /** Return the address of `length` bytes for the arguments and results of one call. */
-  #begin(length) {
-    const address = length < ADDRESSES ? this.exports.kpc_begin(this.limit, length) >>> 0 : 0;
+  #begin(length: number): number {
+    const address = length < ADDRESSES ? this.#exports.kpc_begin(this.limit, length) >>> 0 : 0;
     if (address === 0) throw new BudgetError('decoding takes more memory than the budget allows');
     return address;
   }
 
-  #put(address, bytes) {
-    new Uint8Array(this.exports.memory.buffer).set(bytes, address);
+  #put(address: number, bytes: Uint8Array): void {
+    new Uint8Array(this.#exports.memory.buffer).set(bytes, address);
   }
 
-  #get(address, length) {
-    return new Uint8Array(this.exports.memory.buffer).slice(address, address + length);
+  #get(address: number, length: number): Uint8Array<ArrayBuffer> {
+    return new Uint8Array(this.#exports.memory.buffer).slice(address, address + length);
   }
 
-  #run(name, values, what, details) {
-    const status = this.exports[name](...values);
+  #run(name: string, values: number[], what: string, details: Details): void {
+    const status = (this.#exports[name] as (...values: number[]) => number)(...values);
     if (status === NO_MEMORY) throw new BudgetError(`${what}: decoding takes more memory than the budget allows`);
-    if (status !== 0) throw new FormatError(`${what}: ${MESSAGES[status](details)}`);
+    if (status !== 0) throw new FormatError(`${what}: ${(MESSAGES[status] as (details: Details) => string)(details)}`);
   }
 }

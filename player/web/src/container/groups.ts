@@ -1,22 +1,40 @@
 /** Clips in groups (section 4.7 of spec/kpc-format.md). */
 
-import { CODEC, Container, HEADER_LENGTH, isCritical } from './container.js';
+import type { Core } from '../decoder/core.js';
+import { CODEC, Container, type Entry, HEADER_LENGTH, isCritical } from './container.js';
 import { FormatError } from './errors.js';
-import { META_LIMIT, parseMetadata } from './metadata.js';
-import { Scene } from './scene.js';
+import { META_LIMIT, type Metadata, parseMetadata } from './metadata.js';
+import { Scene, type SceneOptions } from './scene.js';
 import { LIMIT } from './scene_chunks.js';
+
+/** The first and the last frame of a group. */
+export interface Span {
+  first: number;
+  last: number;
+}
+
+/** A group in the picture at a time of the clip, with its own time and its share. */
+export interface Part {
+  group: number;
+  localTime: number;
+  share: number;
+}
 
 /** The groups of a file. A file without GRUP chunks counts as one group. */
 export class Groups {
-  /**
-   * @param {Uint8Array} bytes
-   * @param {import('./core.js').Core} core
-   * @param {{allowPartial?: boolean, memoryBudget?: number}} [options]
-   */
-  constructor(bytes, core, options = {}) {
+  readonly container: Container;
+  /** The frames of each group. */
+  readonly spans: Span[];
+  readonly first: Scene;
+  readonly metadata: Metadata;
+  readonly chunks: number[];
+
+  constructor(
+    bytes: Uint8Array,
+    readonly core: Core,
+    readonly options: SceneOptions = {},
+  ) {
     this.container = new Container(bytes, options);
-    this.core = core;
-    this.options = options;
     const { index } = this.container;
     const chunks = [...index.keys()].filter((number) => index[number].kind === 'GRUP');
     this.chunks = chunks.sort((a, b) => index[a].group - index[b].group);
@@ -33,17 +51,17 @@ export class Groups {
   }
 
   /** Whether a group is complete. */
-  available(/** @type {number} */ number) {
+  available(number: number): boolean {
     return this.chunks.length === 0 || this.container.available(this.chunks[number]);
   }
 
   /** Open the scene of a group. */
-  open(/** @type {number} */ number) {
+  open(number: number): Scene {
     return number === 0 ? this.first : this.#open(number);
   }
 
   /** Return the group shown at a time in [0, 1] of the clip, and the group's own time. */
-  at(/** @type {number} */ time) {
+  at(time: number): { group: number; localTime: number } {
     const current = this.#frame(time);
     let group = 0;
     for (let i = 1; i < this.spans.length; i++) {
@@ -53,7 +71,7 @@ export class Groups {
   }
 
   /** Return the groups in the picture at a time of the clip, with their own times and shares. */
-  blendAt(/** @type {number} */ time) {
+  blendAt(time: number): Part[] {
     const current = this.#frame(time);
     for (let i = 1; i < this.spans.length; i++) {
       const [first, last] = [this.spans[i].first, this.spans[i - 1].last];
@@ -68,17 +86,17 @@ export class Groups {
     return [{ ...this.at(time), share: 1 }];
   }
 
-  #frame(time) {
+  #frame(time: number): number {
     const [first, last] = [this.spans[0].first, this.spans[this.spans.length - 1].last];
     return first + time * (last - first);
   }
 
-  #localTime(group, current) {
+  #localTime(group: number, current: number): number {
     const { first, last } = this.spans[group];
     return last === first ? 0 : Math.min(Math.max((current - first) / (last - first), 0), 1);
   }
 
-  #open(/** @type {number} */ number) {
+  #open(number: number): Scene {
     const entry = this.container.index[this.chunks[number]];
     const bytes = this.container.bytes.subarray(entry.offset, entry.offset + entry.storedLength);
     const allowPartial = !this.available(number);
@@ -102,7 +120,8 @@ export class Groups {
     const { index } = this.container;
     for (const [number, entry] of index.entries()) {
       if (entry.kind !== 'GRUP') {
-        if (isCritical(entry)) throw new FormatError(`chunk ${number} (${entry.kind}) lies outside the groups; update kpc`);
+        if (isCritical(entry))
+          throw new FormatError(`chunk ${number} (${entry.kind}) lies outside the groups; update kpc`);
       } else if (
         entry.codec !== CODEC.RAW ||
         entry.rawLength !== entry.storedLength ||
@@ -118,7 +137,7 @@ export class Groups {
     }
   }
 
-  #metadata() {
+  #metadata(): Metadata {
     if (this.chunks.length === 0) return this.first.metadata;
     const { index } = this.container;
     const found = [...index.keys()].filter((number) => index[number].kind === 'meta');
@@ -128,13 +147,15 @@ export class Groups {
   }
 }
 
-const spanOf = (entry) => ({ first: entry.rowStart, last: entry.rowStart + entry.rowCount - 1 });
+const spanOf = (entry: Entry): Span => ({ first: entry.rowStart, last: entry.rowStart + entry.rowCount - 1 });
 
-function checkSpans(/** @type {{first: number, last: number}[]} */ spans) {
+function checkSpans(spans: Span[]): void {
   for (let g = 0; g + 1 < spans.length; g++) {
     const [before, after] = [spans[g], spans[g + 1]];
     if (!(before.first < after.first && after.first <= before.last + 1 && before.last < after.last)) {
-      throw new FormatError(`groups ${g} and ${g + 1}: each must begin and end later than the one before, without a gap`);
+      throw new FormatError(
+        `groups ${g} and ${g + 1}: each must begin and end later than the one before, without a gap`,
+      );
     }
   }
   for (let g = 0; g + 2 < spans.length; g++) {
@@ -143,5 +164,6 @@ function checkSpans(/** @type {{first: number, last: number}[]} */ spans) {
     }
   }
   const frames = spans[spans.length - 1].last - spans[0].first + 1;
-  if (frames > LIMIT.FRAME) throw new FormatError(`${frames} frames exceed the limit of ${LIMIT.FRAME}; split the clip`);
+  if (frames > LIMIT.FRAME)
+    throw new FormatError(`${frames} frames exceed the limit of ${LIMIT.FRAME}; split the clip`);
 }

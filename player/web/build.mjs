@@ -1,0 +1,87 @@
+/**
+ * Builds the player: `node build.mjs` writes dist/, `node build.mjs --test [NAME ...]` runs all tests or those,
+ * `node build.mjs --out FOLDER` writes to another folder.
+ *
+ * Everything is inlined: the decoder core (format/core), the shaders (player/gl/glsl), the schema of metadata (spec),
+ * and the text of the worker, which `import source from './worker.ts?text'` bundles. Nothing is copied.
+ */
+
+import { spawnSync } from 'node:child_process';
+import { readdirSync, rmSync } from 'node:fs';
+import { basename, join, resolve } from 'node:path';
+import { parseArgs } from 'node:util';
+import * as esbuild from 'esbuild';
+
+const FOLDER = import.meta.dirname;
+const NOTICE = '/*! kpc-player, Apache-2.0. Contains fzstd, Copyright (c) 2020 Arjun Barrett, MIT License. */';
+
+const OPTIONS = {
+  absWorkingDir: FOLDER,
+  bundle: true,
+  charset: 'utf8',
+  loader: { '.wasm': 'binary', '.glsl': 'text' },
+  logLevel: 'warning',
+  target: 'es2022',
+};
+const MINIFIED = { ...OPTIONS, minify: true, legalComments: 'none' };
+
+const bundledText = {
+  name: 'bundled text',
+  setup(build) {
+    build.onResolve({ filter: /\?text$/ }, ({ path, resolveDir }) => ({
+      namespace: 'bundled-text',
+      path: resolve(resolveDir, path.replace(/\?text$/, '')),
+    }));
+    build.onLoad({ filter: /.*/, namespace: 'bundled-text' }, async ({ path }) => {
+      const { metafile, outputFiles } = await esbuild.build({
+        ...MINIFIED,
+        entryPoints: [path],
+        format: 'iife',
+        metafile: true,
+        write: false,
+      });
+      const watchFiles = Object.keys(metafile.inputs).map((file) => join(FOLDER, file));
+      return { contents: outputFiles[0].text, loader: 'text', watchFiles };
+    });
+  },
+};
+
+/** Write the module and, for pages that forbid workers from blobs, the worker. */
+async function build(outdir) {
+  const options = { ...MINIFIED, banner: { js: NOTICE }, outdir };
+  await esbuild.build({
+    ...options,
+    entryPoints: { 'kpc-player': 'src/index.ts' },
+    format: 'esm',
+    plugins: [bundledText],
+  });
+  await esbuild.build({ ...options, entryPoints: { 'kpc-worker': 'src/decoder/worker.ts' }, format: 'iife' });
+}
+
+/** Bundle the tests, all or those of these names, and run them; return the exit status. */
+async function test(names) {
+  const files = readdirSync(join(FOLDER, 'tests')).filter((name) => name.endsWith('.test.ts'));
+  const chosen = files.filter((name) => names.length === 0 || names.includes(basename(name, '.test.ts')));
+  const outdir = join(FOLDER, 'build', 'tests');
+  rmSync(outdir, { recursive: true, force: true });
+  await esbuild.build({
+    ...OPTIONS,
+    entryPoints: chosen.map((name) => `tests/${name}`),
+    format: 'esm',
+    outExtension: { '.js': '.mjs' },
+    outdir,
+    platform: 'node',
+    plugins: [bundledText],
+    sourcemap: 'inline',
+  });
+  const built = chosen.map((name) => join(outdir, name.replace(/ts$/, 'mjs')));
+  return spawnSync(process.execPath, ['--enable-source-maps', '--test', ...built], { cwd: FOLDER, stdio: 'inherit' })
+    .status;
+}
+
+const { values, positionals } = parseArgs({
+  options: { test: { type: 'boolean' }, out: { type: 'string', default: join(FOLDER, 'dist') } },
+  allowPositionals: true,
+});
+if (values.test) process.exitCode = await test(positionals);
+else await build(resolve(values.out));
