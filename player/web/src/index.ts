@@ -1,8 +1,9 @@
 /** What the package exports. */
 
-export { Container, type Entry, type Header } from './container/container.js';
-export { BudgetError, FormatError } from './container/errors.js';
-export { Groups, type Part, type Span } from './container/groups.js';
+export type { Entry } from './container/chunk.js';
+export { Container, type Header } from './container/container.js';
+export { BudgetError, type ErrorCode, FormatError, KpcError } from './container/errors.js';
+export { Groups } from './container/groups.js';
 export type { Metadata, ViewLimits } from './container/metadata.js';
 export { type PlaneSymbols, Scene, type SceneOptions } from './container/scene.js';
 export type {
@@ -17,5 +18,7 @@ export type {
   Scale,
   SceneHead,
 } from './container/scene_chunks.js';
+export { type Part, type Span, Timeline } from './container/timeline.js';
 export { Core, type SegmentSymbols } from './decoder/core.js';
 export { loadCore } from './decoder/module.js';
+export { DecoderPool, type PoolOptions } from './decoder/pool.js';

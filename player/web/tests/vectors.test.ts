@@ -80,7 +80,7 @@ for (const [name, expected] of Object.entries(MANIFEST.valid)) {
     test(`valid ${name}`, () => {
       const groups = new Groups(bytes, core, options);
       assert.deepEqual(
-        groups.spans.map(({ first, last }) => [first, last - first + 1]),
+        groups.timeline.spans.map(({ first, last }) => [first, last - first + 1]),
         expected.groups.map((group: Json) => [group.row_start, group.row_count]),
       );
       assert.deepEqual(groups.metadata, expected.metadata ?? {});
@@ -90,10 +90,10 @@ for (const [name, expected] of Object.entries(MANIFEST.valid)) {
         assert.deepEqual(described(groups.open(number)), whole);
       }
       for (const moment of expected.times) {
-        const { group, localTime } = groups.at(moment.time);
+        const { group, localTime } = groups.timeline.at(moment.time);
         assert.equal(group, moment.group);
         assert.ok(Math.abs(localTime - moment.local_time) < 1e-6);
-        const blend = groups.blendAt(moment.time);
+        const blend = groups.timeline.blendAt(moment.time);
         assert.deepEqual(
           blend.map((part) => String(part.group)),
           Object.keys(moment.blend),
@@ -117,7 +117,7 @@ for (const [name, expected] of Object.entries(MANIFEST.invalid)) {
     const bytes = read(`spec/vectors/invalid/${name}.kpc`);
     const decode = () => {
       const groups = new Groups(bytes, core);
-      for (const number of groups.spans.keys()) described(groups.open(number));
+      for (const number of groups.timeline.spans.keys()) described(groups.open(number));
     };
     assert.throws(decode, (error: Error) => error.name === expected.error && error.message.includes(expected.message));
   });

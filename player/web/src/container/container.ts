@@ -3,6 +3,7 @@
  * what a scene is.
  */
 
+import { Chunk, type Entry, EXPANSION_LIMIT } from './chunk.js';
 import { crc32c } from './crc32c.js';
 import { FormatError } from './errors.js';
 import { unpackFrame } from './zstd.js';
@@ -11,24 +12,7 @@ export const MAGIC: readonly number[] = [0x89, 0x4b, 0x50, 0x43, 0x0d, 0x0a, 0x1
 export const VERSION = 1;
 export const HEADER_LENGTH = 48;
 export const ENTRY_LENGTH = 30;
-export const EXPANSION_LIMIT = 32768;
 export const CHUNK_LIMIT = 1 << 16;
-export const CODEC = { RAW: 0, ZSTD: 1, PREDICTIVE: 2, TRANSFORM: 3, MOTION: 4, OCCUPANCY: 5, WEIGHTS: 6, POSES: 7 };
-
-/** A chunk, as the index lists it; `offset` is its position in the file. */
-export interface Entry {
-  kind: string;
-  group: number;
-  scale: number;
-  plane: number;
-  rowStart: number;
-  rowCount: number;
-  codec: number;
-  storedLength: number;
-  rawLength: number;
-  crc: number;
-  offset: number;
-}
 
 /** What the header says (section 4.1). */
 export interface Header {
@@ -46,9 +30,6 @@ export interface ContainerOptions {
   /** Stored chunks beyond the bytes that are given, by their numbers. */
   bodies?: ReadonlyMap<number, Uint8Array>;
 }
-
-/** Whether a reader must know the kind of a chunk (section 4.3). */
-export const isCritical = (entry: Entry) => entry.kind[0] < 'a';
 
 /**
  * Random access to the chunks of a file that is in memory: whole or, if `allowPartial`, its beginning, and chunks that
@@ -68,55 +49,16 @@ export class Container {
   }
 
   /** Whether all bytes of a chunk are there. */
-  available(number: number) {
+  available(number: number): boolean {
     const entry = this.index[number];
     return entry.offset + entry.storedLength <= this.bytes.length || this.#bodies.get(number) !== undefined;
   }
 
-  /** Return a chunk as it lies in the file, its CRC32C verified. */
-  stored(number: number) {
+  /** Return a chunk, which may not be there. */
+  chunk(number: number): Chunk {
     const entry = this.index[number];
-    if (!this.available(number)) throw new FormatError(`cut off: ${this.label(number)} is not there`);
-    const body = this.#bodies.get(number) ?? this.bytes.subarray(entry.offset, entry.offset + entry.storedLength);
-    if (body.length !== entry.storedLength || crc32c(body) !== entry.crc) {
-      throw new FormatError(`${this.label(number)} is damaged (its CRC32C differs); fetch the file again`);
-    }
-    return body;
-  }
-
-  /** Return the content of a chunk under RAW or ZSTD, of at most `limit` bytes. */
-  content(number: number, limit = Infinity) {
-    const entry = this.index[number];
-    if (entry.rawLength > limit) {
-      throw new FormatError(`${this.label(number)} claims ${entry.rawLength} bytes where at most ${limit} make sense`);
-    }
-    let content = this.stored(number);
-    if (entry.codec === CODEC.ZSTD) content = unpackFrame(content, entry.rawLength, this.label(number));
-    else if (entry.codec !== CODEC.RAW) {
-      throw new FormatError(`${this.label(number)} uses codec ${entry.codec}, unknown to this reader; update kpc`);
-    }
-    if (content.length !== entry.rawLength) {
-      throw new FormatError(
-        `${this.label(number)} holds ${content.length} bytes, not the ${entry.rawLength} it claims`,
-      );
-    }
-    return content;
-  }
-
-  /** Return a chunk under one of the codecs from PREDICTIVE on as it is stored, if it may hold what it claims. */
-  coded(number: number) {
-    const entry = this.index[number];
-    if (entry.rawLength > entry.storedLength * EXPANSION_LIMIT) {
-      throw new FormatError(
-        `${this.label(number)} claims a length of ${entry.rawLength}, more than ${entry.storedLength} bytes can hold`,
-      );
-    }
-    return this.stored(number);
-  }
-
-  /** Return the name of a chunk in messages. */
-  label(number: number) {
-    return `chunk ${number} (${this.index[number].kind})`;
+    const held = this.#bodies.get(number) ?? this.bytes.subarray(entry.offset, entry.offset + entry.storedLength);
+    return new Chunk(number, entry, this.available(number) ? held : null);
   }
 }
 
@@ -124,18 +66,18 @@ export class Container {
 export function readHeader(bytes: Uint8Array, allowPartial: boolean): Header {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
   if (bytes.length === 0 || MAGIC.some((byte, k) => k < bytes.length && bytes[k] !== byte)) {
-    throw new FormatError('not a .kpc file');
+    throw new FormatError('not a .kpc file', 'foreign');
   }
   if (bytes.length >= 12) {
-    if (view.getUint16(10, true) === 0) throw new FormatError('a draft of the format; encode it again');
+    if (view.getUint16(10, true) === 0) throw new FormatError('a draft of the format; encode it again', 'draft');
     const version = view.getUint16(8, true);
     if (version !== VERSION) {
-      throw new FormatError(`format version ${version}, this reader knows ${VERSION}; update kpc`);
+      throw new FormatError(`format version ${version}, this reader knows ${VERSION}; update kpc`, 'newer');
     }
   }
-  if (bytes.length < HEADER_LENGTH) throw new FormatError('cut off within the header; fetch the file again');
+  if (bytes.length < HEADER_LENGTH) throw new FormatError('cut off within the header; fetch the file again', 'cut-off');
   if (crc32c(bytes.subarray(0, 44)) !== view.getUint32(44, true)) {
-    throw new FormatError('the header is damaged (its CRC32C differs); fetch the file again');
+    throw new FormatError('the header is damaged (its CRC32C differs); fetch the file again', 'damaged');
   }
   if (view.getUint16(10, true) !== HEADER_LENGTH) {
     throw new FormatError(`the header claims ${view.getUint16(10, true)} bytes, not ${HEADER_LENGTH}`);
@@ -162,7 +104,7 @@ function checkSizes(header: Header, size: number, allowPartial: boolean): void {
     );
   }
   if (size > fileLength) throw new FormatError(`${size - fileLength} bytes follow the end of the file`);
-  if (size < fileLength && !allowPartial) throw new FormatError(`cut off at ${size} of ${fileLength} bytes`);
+  if (size < fileLength && !allowPartial) throw new FormatError(`cut off at ${size} of ${fileLength} bytes`, 'cut-off');
   if (Math.max(valueCount, largestRaw) > fileLength * EXPANSION_LIMIT) {
     throw new FormatError(
       `claims ${valueCount} values and chunks of ${largestRaw} bytes, more than ${fileLength} bytes can hold`,
@@ -173,10 +115,10 @@ function checkSizes(header: Header, size: number, allowPartial: boolean): void {
 /** Read and check the index (section 4.2). */
 function readIndex(bytes: Uint8Array, header: Header): Entry[] {
   const { chunkCount, indexLength, indexCrc, fileLength, largestRaw } = header;
-  if (bytes.length < HEADER_LENGTH + indexLength) throw new FormatError('cut off within the chunk index');
+  if (bytes.length < HEADER_LENGTH + indexLength) throw new FormatError('cut off within the chunk index', 'cut-off');
   const index = bytes.subarray(HEADER_LENGTH, HEADER_LENGTH + indexLength);
   if (crc32c(index) !== indexCrc) {
-    throw new FormatError('the chunk index is damaged (its CRC32C differs); fetch the file again');
+    throw new FormatError('the chunk index is damaged (its CRC32C differs); fetch the file again', 'damaged');
   }
   const table = unpackFrame(index, ENTRY_LENGTH * chunkCount, 'chunk index');
   const row = new Uint8Array(ENTRY_LENGTH);

@@ -1,7 +1,9 @@
 /** A scene in a .kpc file: which chunks it needs, and what they hold (sections 4.3, 6, 7 and 10 of the spec). */
 
 import type { Core, SegmentSymbols } from '../decoder/core.js';
-import { CODEC, Container, type ContainerOptions, type Entry, isCritical } from './container.js';
+import { decodeSegment, type Projection } from '../decoder/segment.js';
+import { CODEC, type Entry, isCritical } from './chunk.js';
+import { Container, type ContainerOptions } from './container.js';
 import { BudgetError, FormatError } from './errors.js';
 import { META_LIMIT, type Metadata, parseMetadata } from './metadata.js';
 import {
@@ -38,6 +40,8 @@ const AXIS_OF: Record<string, number> = { t: 0, z: 1, y: 2, x: 3 };
 export interface SceneOptions extends ContainerOptions {
   /** Bytes that the scene may take. */
   memoryBudget?: number;
+  /** Whether the caller never holds all planes, and accounts for the memory of those that it holds. */
+  inParts?: boolean;
 }
 
 /** A plane of a file of which all or some rows are there; the values of the others come from `offset` alone. */
@@ -53,18 +57,19 @@ export class Scene {
   readonly core: Core;
   readonly memoryBudget: number;
   readonly #decoded = new Map<string, unknown>();
+  readonly #counted = new Map<string, number>();
 
   constructor(bytes: Uint8Array, core: Core, options: SceneOptions = {}) {
     this.container = new Container(bytes, options);
     this.core = core;
     this.#checkKinds();
-    this.head = parseHead(this.container.content(this.#only('SCNE'), HEAD_LIMIT));
+    this.head = parseHead(this.container.chunk(this.#only('SCNE')).content(HEAD_LIMIT));
     const { valueCount } = this.container.header;
     if (this.head.valueCount !== valueCount) {
       throw new FormatError(`the header claims ${valueCount} values, the scene ${this.head.valueCount}`);
     }
     this.memoryBudget = options.memoryBudget ?? 2 ** 31;
-    this.#afford(0, 'its planes');
+    this.#afford(options.inParts ? 0 : 5 * this.head.valueCount, 'its planes');
     this.#checkSegments();
     this.#decoderNumber();
     this.#only('OCCU');
@@ -72,15 +77,15 @@ export class Scene {
 
   /** The mapping of space; null if the box bounds the scene. */
   get mapping(): Mapping | null {
-    return this.#once('WARP', (number) => parseMapping(this.container.content(number, 116), this.head));
+    return this.#once('WARP', (number) => parseMapping(this.container.chunk(number).content(116), this.head));
   }
 
   /** The motion grid; null if there is none. */
   get motion(): MotionGrid | null {
     return this.#once('MOVE', (number, entry) => {
       this.#afford(8 * entry.rawLength, 'its motion grid');
-      if (entry.codec !== CODEC.MOTION) return parseMotion(this.container.content(number), this.head.isDynamic);
-      const body = this.container.coded(number);
+      if (entry.codec !== CODEC.MOTION) return parseMotion(this.container.chunk(number).content(), this.head.isDynamic);
+      const body = this.container.chunk(number).coded();
       const { count } = parseMotionHead(new Cursor(body, 'MOVE'), this.head.isDynamic);
       this.#checkClaim('MOVE', entry, 12 + 2 * count);
       return parseMotion(this.core.motion(body, entry.rawLength), this.head.isDynamic);
@@ -91,8 +96,8 @@ export class Scene {
   get occupancy(): OccupancyGrid {
     return this.#held('OCCU', (number, entry) => {
       this.#afford(8 * entry.rawLength, 'its occupancy grid');
-      if (entry.codec !== CODEC.OCCUPANCY) return parseOccupancy(this.container.content(number));
-      const body = this.container.coded(number);
+      if (entry.codec !== CODEC.OCCUPANCY) return parseOccupancy(this.container.chunk(number).content());
+      const body = this.container.chunk(number).coded();
       const { cells } = parseOccupancyHead(new Cursor(body, 'OCCU'));
       this.#checkClaim('OCCU', entry, 8 + Math.ceil(cells / 8));
       return parseOccupancy(this.core.occupancy(body, entry.rawLength));
@@ -105,9 +110,9 @@ export class Scene {
     return this.#held(kind, (number, entry) => {
       if (entry.codec !== CODEC.WEIGHTS) {
         const most = 10 + 2 * (LIMIT.HIDDEN + 3) * (4 * this.head.features + 2 * LIMIT.HIDDEN + 16);
-        return parseDecoder(this.container.content(number, most), kind, this.head.features);
+        return parseDecoder(this.container.chunk(number).content(most), kind, this.head.features);
       }
-      const body = this.container.coded(number);
+      const body = this.container.chunk(number).coded();
       const { isHybrid, rawLength } = parseDecoderHead(new Cursor(body, kind), this.head.features);
       if (entry.rawLength !== rawLength) {
         throw new FormatError(`${kind}: claims ${entry.rawLength} bytes of weights, not those of its sizes`);
@@ -119,8 +124,8 @@ export class Scene {
   /** The cameras; none if the file has, or has yet, no such chunk. */
   get cameras(): Camera[] {
     const found = this.#once('came', (number, entry) => {
-      if (entry.codec !== CODEC.POSES) return parseCameras(this.container.content(number, 2 + 68 * LIMIT.CAMERA));
-      return parseCameras(this.core.poses(this.container.coded(number), entry.rawLength));
+      if (entry.codec !== CODEC.POSES) return parseCameras(this.container.chunk(number).content(2 + 68 * LIMIT.CAMERA));
+      return parseCameras(this.core.poses(this.container.chunk(number).coded(), entry.rawLength));
     });
     return found ?? [];
   }
@@ -131,14 +136,14 @@ export class Scene {
       const { hidden } = this.decoder;
       this.#afford(4 * entry.rawLength, 'its appearances');
       const most = 4 + LIMIT.APPEARANCE * (2 * hidden + 1 + LIMIT.NAME);
-      return parseAppearances(this.container.content(number, most), hidden);
+      return parseAppearances(this.container.chunk(number).content(most), hidden);
     });
     return found ?? [];
   }
 
   /** The metadata; an empty object if the file has, or has yet, no such chunk. */
   get metadata(): Metadata {
-    return this.#once('meta', (number) => parseMetadata(this.container.content(number, META_LIMIT))) ?? {};
+    return this.#once('meta', (number) => parseMetadata(this.container.chunk(number).content(META_LIMIT))) ?? {};
   }
 
   /** Return what SCNE says of the plane that a PLNE chunk is a segment of, and the name of the plane. */
@@ -149,23 +154,20 @@ export class Scene {
 
   /** Decode a PLNE chunk: symbols and coded texels of its rows. */
   segment(number: number): SegmentSymbols {
-    const entry = this.container.index[number];
-    const { name, plane } = this.planeOf(entry);
-    const { rows, columns, channels } = plane;
-    const texels = entry.rowCount * columns;
-    const sizes = [entry.rowCount, columns, channels] as const;
-    if (entry.codec !== CODEC.PREDICTIVE && entry.codec !== CODEC.TRANSFORM) {
-      const content = this.container.content(number, 1 + Math.ceil(texels / 8) + channels * texels);
-      return this.core.segment(CODEC.RAW, content, ...sizes);
+    const chunk = this.container.chunk(number);
+    const { name, plane } = this.planeOf(chunk.entry);
+    return decodeSegment(this.core, chunk, plane, () => this.projection(name));
+  }
+
+  /** Return the occupancy grid projected onto a plane. */
+  projection(name: PlaneName): Projection {
+    const { sizes, content } = this.occupancy;
+    const cells: [number, number] = [sizes[AXIS_OF[name[1]]], sizes[AXIS_OF[name[0]]]];
+    if (!this.#decoded.has(name)) {
+      this.#afford(cells[0] * cells[1], `the projection of its occupancy onto ${name}`);
+      this.#decoded.set(name, this.core.project(content, PLANES.indexOf(name), cells[0] * cells[1]));
     }
-    if (entry.rawLength !== texels * channels) {
-      const label = this.container.label(number);
-      throw new FormatError(`${label} claims ${entry.rawLength} symbols, not the ${texels * channels} of its rows`);
-    }
-    const body = this.container.coded(number);
-    const isImplied = body.length > 1 && (body[1] & 3) === 2;
-    const map = isImplied ? this.#impliedMap(name, rows, columns, entry) : null;
-    return this.core.segment(entry.codec, body, ...sizes, map);
+    return { projected: this.#decoded.get(name) as Uint8Array, cells };
   }
 
   /** Decode all planes, of which rows that are not there count as section 10 says. */
@@ -194,16 +196,6 @@ export class Scene {
     return found;
   }
 
-  #impliedMap(name: PlaneName, rows: number, columns: number, entry: Entry): Uint8Array {
-    const { sizes, content } = this.occupancy;
-    const cells = [sizes[AXIS_OF[name[1]]], sizes[AXIS_OF[name[0]]]];
-    if (!this.#decoded.has(name)) {
-      this.#decoded.set(name, this.core.project(content, entry.plane, cells[0] * cells[1]));
-    }
-    const projected = this.#decoded.get(name) as Uint8Array;
-    return this.core.impliedMap(projected, cells, rows, columns, entry.rowStart, entry.rowCount);
-  }
-
   /** Return what `parse` makes of the one chunk of a kind, the first time; null if there is none, or not yet. */
   #once<T>(kind: string, parse: (number: number, entry: Entry) => T): T | null {
     if (!this.#decoded.has(kind)) {
@@ -225,8 +217,10 @@ export class Scene {
     }
   }
 
+  /** Count memory beside the planes against the budget, together with all that was counted before. */
   #afford(more: number, what: string): void {
-    const needed = 5 * this.head.valueCount + more;
+    this.#counted.set(what, more);
+    const needed = [...this.#counted.values()].reduce((a, b) => a + b, 0);
     if (needed > this.memoryBudget) {
       throw new BudgetError(
         `needs ${needed} bytes of memory with ${what}, more than the budget of ${this.memoryBudget}`,
@@ -255,7 +249,10 @@ export class Scene {
     const unknown = index.findIndex((entry) => isCritical(entry) && !KNOWN_KINDS.includes(entry.kind));
     if (unknown >= 0) {
       const { kind } = index[unknown];
-      throw new FormatError(`chunk ${unknown} is of the critical kind ${kind}, unknown to this reader; update kpc`);
+      throw new FormatError(
+        `chunk ${unknown} is of the critical kind ${kind}, unknown to this reader; update kpc`,
+        'newer',
+      );
     }
   }
 
@@ -276,7 +273,7 @@ export class Scene {
         }
         segments.push(entry);
       } else if (KNOWN_KINDS.includes(entry.kind) && (group || scale || plane || rowStart || rowCount)) {
-        throw new FormatError(`${this.container.label(number)} claims a position among the planes`);
+        throw new FormatError(`${this.container.chunk(number).label} claims a position among the planes`);
       }
     }
     for (const [key, segments] of found) {

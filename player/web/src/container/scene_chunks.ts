@@ -212,7 +212,8 @@ export function parseMapping(bytes: Uint8Array, head: SceneHead): Mapping {
   const cursor = new Cursor(bytes, 'WARP');
   const mapping = bytes.length < 4 ? 0 : cursor.u32();
   if (mapping === 2) return parseDeviceCoordinates(cursor, head);
-  if (mapping !== 1) throw new FormatError(`WARP: mapping ${mapping} of space, unknown to this reader; update kpc`);
+  if (mapping !== 1)
+    throw new FormatError(`WARP: mapping ${mapping} of space, unknown to this reader; update kpc`, 'newer');
   const uniformDistance = cursor.f64();
   cursor.finish();
   const inRange = uniformDistance >= 1 / LIMIT.BOX && uniformDistance <= LIMIT.BOX;

@@ -60,6 +60,11 @@ export class Core {
     this.#exports = new WebAssembly.Instance(module).exports as unknown as Exports;
   }
 
+  /** Bytes that the instance's memory takes; it never shrinks. */
+  get memoryBytes(): number {
+    return this.#exports.memory.buffer.byteLength;
+  }
+
   /**
    * Decode a plane segment (section 7) under any codec; `body` is of ZSTD what the frame holds, and `implied` the
    * implied map where the body needs it.

@@ -1,0 +1,107 @@
+/** What a worker does for the page: each task says all that is needed, so that any worker can do any task. */
+
+import { Chunk, type Entry } from '../container/chunk.js';
+import { META_LIMIT, type Metadata, parseMetadata } from '../container/metadata.js';
+import { Scene } from '../container/scene.js';
+import type {
+  Appearance,
+  Camera,
+  DecoderWeights,
+  Mapping,
+  MotionGrid,
+  OccupancyGrid,
+  PlaneHead,
+  SceneHead,
+} from '../container/scene_chunks.js';
+import type { Core } from './core.js';
+import { decodeSegment, type Projection } from './segment.js';
+import { layerTexels } from './texels.js';
+
+/** Everything that is in a scene but planes. */
+export interface SceneContent {
+  head: SceneHead;
+  mapping: Mapping | null;
+  motion: MotionGrid | null;
+  occupancy: OccupancyGrid;
+  decoder: DecoderWeights;
+  cameras: Camera[];
+  appearances: Appearance[];
+  metadata: Metadata;
+}
+
+/** Read all of a scene but its planes from header and index, `start`, and stored chunks. */
+export interface SceneTask {
+  kind: 'scene';
+  start: Uint8Array;
+  bodies: ReadonlyMap<number, Uint8Array>;
+  memoryBudget: number;
+}
+
+/** Read a meta chunk beside groups. */
+export interface MetadataTask {
+  kind: 'metadata';
+  number: number;
+  entry: Entry;
+  body: Uint8Array;
+}
+
+/** Project the occupancy grid, its content under RAW, onto the plane of this number. */
+export interface ProjectTask {
+  kind: 'project';
+  content: Uint8Array;
+  plane: number;
+  cells: [number, number];
+}
+
+/** Decode a segment of a plane: to texels for a texture if `asTexels`, else to symbols. */
+export interface SegmentTask {
+  kind: 'segment';
+  number: number;
+  entry: Entry;
+  body: Uint8Array;
+  plane: PlaneHead;
+  projection: Projection | null;
+  asTexels: boolean;
+}
+
+export type Task = SceneTask | MetadataTask | ProjectTask | SegmentTask;
+export type Result<T extends Task> = T extends SceneTask
+  ? SceneContent
+  : T extends MetadataTask
+    ? Metadata
+    : T extends ProjectTask
+      ? Projection
+      : Int8Array<ArrayBuffer> | Uint16Array<ArrayBuffer>;
+
+/** Do a task; return its result, and the buffers of it that are moved to the page instead of being copied. */
+export function perform(core: Core, task: Task): { result: Result<Task>; moved: ArrayBuffer[] } {
+  switch (task.kind) {
+    case 'scene':
+      return readScene(core, task);
+    case 'metadata': {
+      const chunk = new Chunk(task.number, task.entry, task.body);
+      return { result: parseMetadata(chunk.content(META_LIMIT)), moved: [] };
+    }
+    case 'project': {
+      const [rows, columns] = task.cells;
+      const projected = core.project(task.content, task.plane, rows * columns);
+      return { result: { projected, cells: task.cells }, moved: [] };
+    }
+    case 'segment': {
+      const { plane, asTexels } = task;
+      const chunk = new Chunk(task.number, task.entry, task.body);
+      const { symbols } = decodeSegment(core, chunk, plane, () => task.projection as Projection);
+      const result = asTexels ? layerTexels(symbols, plane) : symbols;
+      return { result, moved: [result.buffer] };
+    }
+  }
+}
+
+function readScene(core: Core, { start, bodies, memoryBudget }: SceneTask) {
+  const scene = new Scene(start, core, { allowPartial: true, inParts: true, bodies, memoryBudget });
+  const { head, mapping, motion, occupancy, decoder, cameras, appearances, metadata } = scene;
+  const result = { head, mapping, motion, occupancy, decoder, cameras, appearances, metadata };
+  const moved = [occupancy.occupied.buffer as ArrayBuffer];
+  if (motion) moved.push(motion.displacements.buffer as ArrayBuffer);
+  return { result, moved };
+}
