@@ -3,7 +3,6 @@
 import os
 from dataclasses import dataclass
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import numpy as np
@@ -12,6 +11,7 @@ from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
+from kpc.encoder.datasets.containers import open_container
 from kpc.format.common.errors import MediaError
 
 # Containers whose time line begins at 0, by libav's names. The clocks of others start anywhere.
@@ -180,8 +180,7 @@ def _origin_s(path: str | os.PathLike[str], container: InputContainer, stream: V
     Where an edit list begins between two frames, libav moves the first whole one to where the list begins.
     """
     if container.format.name == MP4 and packets.first is not None and packets.first.is_discard:
-        options = {"advanced_editlist": "0", "protocol_whitelist": "file"}
-        with av.open(f"file:{Path(path).absolute()}", metadata_errors="replace", options=options) as plain:
+        with open_container(path, advanced_editlist="0") as plain:
             same = next(iter(plain.demux(plain.streams[stream.index])), None)
             if same is not None and same.pos == packets.first.pos:
                 return float(((same.pts or 0) - (packets.first.pts or 0)) * (stream.time_base or 0))

@@ -17,7 +17,6 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import av
 import av.filter
@@ -27,6 +26,7 @@ from av.stream import Disposition
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
+from kpc.encoder.datasets.containers import open_container
 from kpc.encoder.datasets.time_stamps import read_time_stamps
 from kpc.format.common.errors import MediaError
 from kpc.format.common.films import SCALE_FLAGS
@@ -170,9 +170,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Vide
     """Open a file and choose its first stream of film."""
     require_file(path)
     try:
-        container = av.open(
-            f"file:{Path(path).absolute()}", metadata_errors="replace", options={"protocol_whitelist": "file"}
-        )
+        container = open_container(path)
     except PermissionError as error:
         raise MediaError(f"{path}: no permission to read it; chmod it or run as its owner") from error
     except (av.FFmpegError, ValueError) as error:

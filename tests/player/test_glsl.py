@@ -8,6 +8,7 @@ from kpc.format.scene.motion import displace
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT
 from kpc.format.scene.space import Contraction, contract
 from kpc.player.cpu.reference import sigmoid
+from kpc.player.gl.renderer import is_software
 from scenes import look_at
 
 N = 1 << 16
@@ -126,4 +127,5 @@ def test_positions_are_displaced(nodes: tuple[int, int, int]) -> None:
     got = gl.evaluate(
         '#include "motion.glsl"\n', f"vec4(displaced(grid, {counts}, a.xyz), 0.0)", columns(*u.T), grid=grid
     )[:, :3]
-    np.testing.assert_allclose(got, displace(u, offsets), atol=2e-6)
+    # A graphics card filters with fractions of 8 bits: 0.0040 on an NVIDIA H100, with offsets of up to 0.3.
+    np.testing.assert_allclose(got, displace(u, offsets), atol=2e-6 if is_software(gl.context()) else 0.006)

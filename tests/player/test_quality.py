@@ -10,7 +10,7 @@ from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, TIME_PLANES, Scene
 from kpc.player.cpu.cpu_renderer import ProcessorRenderer
 from kpc.player.cpu.reference import box_range, render
 from kpc.player.gl import renderer as module
-from kpc.player.gl.renderer import COMPUTE_VERSION, TRIAL_AFTER, Renderer
+from kpc.player.gl.renderer import COMPUTE_VERSION, TRIAL_AFTER, Renderer, is_software
 from kpc.player.quality import DEFAULT, LEVELS, Quality, neighbouring_level
 from processor import psnr
 from scenes import VARIANTS, look_at, tiny_scene
@@ -30,6 +30,8 @@ MEASURED = {
     "hybrid": ((24.8, 24.8), (25.1, 25.1), (28.1, 28.1), (52.1, 52.1), (57.8, 57.8), (70.4, 70.4)),
 }
 MARGIN = 1.0
+# The level `reference`. A graphics card filters textures with fractions of 8 bits: 82.4 to 87.5 dB on an NVIDIA H100.
+REFERENCE_DB, REFERENCE_ON_A_CARD_DB = 100.0, 80.0
 
 
 def test_the_table_ends_at_what_the_format_says() -> None:
@@ -57,8 +59,9 @@ def test_every_level_is_as_near_to_the_reference_as_measured(variant: str, proce
     renderer = Renderer(gl.context(), scene, processor=processor)
     assert (renderer._processor is not None) == (processor and ProcessorRenderer.serves(scene))
     measured = dict(zip(MEASURED_LEVELS, MEASURED[variant], strict=True))
+    exact = REFERENCE_DB if is_software(gl.context()) else REFERENCE_ON_A_CARD_DB
     for name, renderer.quality in LEVELS.items():
-        bound = 100 if name == "reference" else measured[name][processor] - MARGIN
+        bound = exact if name == "reference" else measured[name][processor] - MARGIN
         for time in (0.62, 0.63, 0.64, 0.65):
             got, wanted = renderer.render(CAMERA, time), render(scene, CAMERA, time)
             assert psnr(got.rgb, wanted.rgb) > bound, (name, time)
@@ -134,9 +137,9 @@ def test_what_was_drawn_from_far_away_is_whole_from_near(level: str, processor: 
 def test_steady_playback_allocates_and_compiles_nothing() -> None:
     ctx, scene = gl.context(), tiny_scene(4)
     screen, renderer = ctx.simple_framebuffer((64, 48), 4), Renderer(ctx, scene, LEVELS[DEFAULT])
-    for n in range(12):
+    for n in range(2 * TRIAL_AFTER):
         renderer.show(screen, CAMERA, 0.4 + n / 100)
-        if n == 3:
+        if n == TRIAL_AFTER:  # a card has tried both kinds of shaders by now
             made = renderer.memory_bytes, renderer._programs.names(), set(renderer._targets)
     assert (renderer.memory_bytes, renderer._programs.names(), set(renderer._targets)) == made
 
