@@ -59,17 +59,18 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
     grad_density = np.zeros((workers, layout.features + 1), np.float32)
     basis = field.basis(rays.directions).detach().numpy()
     grad_basis = np.zeros((n, 3, layout.features), np.float32)
-    grad_motion = None if scene.motion is None else np.zeros((workers, *scene.motion.shape), np.float32)
+    planes = fused.planes_of(field)
+    grad_motion = np.zeros((workers, *planes.motion.shape), np.float32)
     peaks = np.zeros((workers, *scene.occupancy.shape[1:]), np.float32)
     errors, counts = kernels.backpropagate(
-        fused.planes_of(field),
+        planes,
         field.density.detach().numpy(),
         fused.volume_of(scene.aabb, scene.occupancy, scene.step, scene.mapping),
         fused.ray_batch(rays),
         basis,
         targets.numpy(),
         np.float32(DISTORTION),
-        kernels.Gradients(grad, grad_density, grad_basis, grad_motion, True),
+        kernels.Gradients(grad, grad_density, grad_basis, grad_motion, scene.motion is not None),
         peaks,
         fused.max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
     )
@@ -77,7 +78,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         "theta": grad.sum(0),
         "density": grad_density.sum(0),
         "basis": grad_basis,
-        "motion": None if grad_motion is None else grad_motion.sum(0),
+        "motion": grad_motion.sum(0),
         "errors": errors,
         "counts": counts,
         "peaks": peaks.max(0),

@@ -26,6 +26,8 @@ def plane_set(
     theta: np.ndarray, layout: Layout, motion: np.ndarray | None, scales: int | None = None
 ) -> kernels.PlaneSet:
     """Return planes (n,) and motion grid as the kernels take them, with the coarsest `scales` only where given."""
+    if motion is None:
+        motion = np.zeros((0, 1, 1, 1, 3), np.float32)
     return kernels.PlaneSet(theta, layout.table[:scales], layout.resolution[:scales], layout.channels, motion)
 
 
@@ -37,7 +39,7 @@ def planes_of(field: Field, scales: int | None = None) -> kernels.PlaneSet:
 
 def volume_of(aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None) -> kernels.Volume:
     """Return where rays take samples; aabb (2, 3) float32, occupancy (slots, Nz, Ny, Nx) bool, step in s."""
-    uniform = np.float32(mapping.uniform_distance) if isinstance(mapping, Contraction) else None
+    uniform = np.float32(mapping.uniform_distance if isinstance(mapping, Contraction) else 0)
     extent = np.max(aabb[1] - aabb[0])
     return kernels.Volume(aabb, uniform, occupancy.view(np.uint8), np.float32(step), np.float32(extent))
 
@@ -97,9 +99,16 @@ def count_samples(
     """Return how many samples `sample_rays` finds on each ray, (N,) int64."""
     starts = np.zeros(len(rays.times), np.int64)
     counts: np.ndarray = kernels.collect_samples(
-        volume_of(aabb, occupancy, step, mapping), ray_batch(rays), starts, None, parts()
+        volume_of(aabb, occupancy, step, mapping), ray_batch(rays), starts, _sample_arrays(0), parts()
     )
     return counts
+
+
+def _sample_arrays(n: int) -> kernels.SampleArrays:
+    """Return room for n samples."""
+    return kernels.SampleArrays(
+        np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.int64)
+    )
 
 
 def sample_rays_fused(
@@ -108,10 +117,7 @@ def sample_rays_fused(
     """Return what `kpc.encoder.field.render.sample_rays` does, by the kernels."""
     counts = count_samples(rays, aabb, occupancy, step, mapping)
     ends = np.cumsum(counts)
-    n = int(ends[-1]) if len(ends) else 0
-    out = kernels.SampleArrays(
-        np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.int64)
-    )
+    out = _sample_arrays(int(ends[-1]) if len(ends) else 0)
     volume = volume_of(aabb, occupancy, step, mapping)
     kernels.collect_samples(volume, ray_batch(rays), ends - counts, out, parts())
     ray = np.repeat(np.arange(len(counts)), counts)
@@ -138,9 +144,9 @@ class FusedFeatures(torch.autograd.Function):
     def backward(ctx, g):  # type: ignore[no-untyped-def]
         planes, workers = ctx.planes, numba.get_num_threads()
         g_theta = np.zeros((workers, planes.theta.size), np.float32)
-        g_motion = None if planes.motion is None else np.zeros((workers, *planes.motion.shape), np.float32)
+        g_motion = np.zeros((workers, *planes.motion.shape), np.float32)
         kernels.scatter_features(planes, g_theta, g_motion, *ctx.at, g.contiguous().numpy())
-        summed = (None if a is None else torch.from_numpy(a.sum(0)) for a in (g_theta, g_motion))
+        summed = (torch.from_numpy(a.sum(0)) if a.size else None for a in (g_theta, g_motion))
         return *summed, None, None, None
 
 

@@ -118,15 +118,15 @@ class FusedOptimiser:
             basis = self.field.basis(batch.directions, self.field.appearance_codes(batch.appearances))
         return (basis[..., : len(mask)] * mask).contiguous()
 
-    def _new_gradients(self, bases: int, F: int, motion: np.ndarray | None, number: int) -> kernels.Gradients:
+    def _new_gradients(self, bases: int, F: int, motion: np.ndarray, number: int) -> kernels.Gradients:
         """Return `Gradients` for a step: the planes' buffers, and zeros."""
         rows = bases if self.config.view_dependent else self.workers
         return kernels.Gradients(
             self.grad,
             np.zeros((self.workers, F + 1), np.float32),
             np.zeros((rows, 3, F), np.float32),
-            None if motion is None else np.zeros((self.workers, *motion.shape), np.float32),
-            motion is not None and number % self.config.motion_every == 0,
+            np.zeros((self.workers, *motion.shape), np.float32),
+            motion.size > 0 and number % self.config.motion_every == 0,
         )
 
     def _step_decoder(self, basis: torch.Tensor, mask: torch.Tensor, gradients: kernels.Gradients, rate: float) -> None:
@@ -141,7 +141,7 @@ class FusedOptimiser:
         field.density.grad[-1] = g_density[-1]
         if field.codes is not None:
             total(appearance_priors(field, config)).backward()  # type: ignore[no-untyped-call]
-        if gradients.wants_motion and field.motion is not None and gradients.motion is not None:
+        if gradients.wants_motion and field.motion is not None:
             total(motion_priors(field, config)).backward()  # type: ignore[no-untyped-call]
             assert field.motion.grad is not None
             field.motion.grad += torch.from_numpy(gradients.motion.sum(0))

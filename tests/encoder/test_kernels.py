@@ -92,7 +92,8 @@ def test_compiled_and_cached_kernels_give_equal_results(tmp_path: Path) -> None:
     script = (
         "import sys, numpy\nfrom kpc.encoder.field import kernels\n"
         "theta, table, resolution, density, points, times = numpy.load(sys.argv[1]).values()\n"
-        f"planes = kernels.PlaneSet(theta, table, resolution, {field.layout.channels}, None)\n"
+        "motion = numpy.zeros((0, 1, 1, 1, 3), numpy.float32)\n"
+        f"planes = kernels.PlaneSet(theta, table, resolution, {field.layout.channels}, motion)\n"
         "logs = kernels.log_densities(planes, density, points, times, 2)\n"
         "sys.stdout.buffer.write(logs.tobytes())"
     )

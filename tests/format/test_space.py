@@ -104,9 +104,8 @@ def _kernels(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.nd
     t, u, stretch = np.empty_like(s), np.empty((*s.shape, 3), np.float32), np.empty_like(s)
     for ray, k in np.ndindex(s.shape):
         t[ray, k] = geometry.ray_distance(s[ray, k], uniform)
-        *u[ray, k], stretch[ray, k] = geometry.ray_point(
-            origins[ray], directions[ray], t[ray, k], scene.aabb, inverse, uniform
-        )
+        *u[ray, k], radius = geometry.ray_point(origins[ray], directions[ray], t[ray, k], scene.aabb, inverse, uniform)
+        stretch[ray, k] = geometry.density_scale(t[ray, k], radius, uniform)
     return t, u, stretch
 
 

@@ -1,7 +1,7 @@
 """Named tuples of arrays that the kernels take.
 
-They are flat, because numba's parallel loops take no nested tuples. Where a member may be None, code that depends on it
-is in a function that takes this member as an argument: numba then compiles only the branch that applies.
+They are flat, because numba's parallel loops take no nested tuples. What a scene lacks is empty or 0 rather than None,
+which has a type of its own: numba would compile every kernel, for ten seconds and more, for each combination.
 """
 
 from typing import NamedTuple
@@ -16,14 +16,14 @@ class PlaneSet(NamedTuple):
     table: np.ndarray  # (S, 6) int64, first element in theta of xy xz yz xt yt zt; -1 where there is no such plane
     resolution: np.ndarray  # (S, 4) int64, texels along x, y, z and t
     channels: int  # M
-    motion: np.ndarray | None  # (T, Nz, Ny, Nx, 3) float32, displacements (`kpc.format.scene.motion`); or None
+    motion: np.ndarray  # (T, Nz, Ny, Nx, 3) float32, displacements (`kpc.format.scene.motion`); T is 0: there are none
 
 
 class Volume(NamedTuple):
     """Where rays take samples. Rays in device coordinates are given as such: to the kernels their scene is a box."""
 
     aabb: np.ndarray  # (2, 3) float32, lower and upper corner
-    uniform_distance: np.float32 | None  # of `kpc.format.scene.space.Contraction`; None where the scene ends at its box
+    uniform_distance: np.float32  # of `kpc.format.scene.space.Contraction`; 0 where the scene ends at its box
     occupancy: np.ndarray  # (slots, Nz, Ny, Nx) uint8
     step: np.float32  # length of a step, in s
     extent: np.float32  # longest edge of the box: densities are per this length
@@ -45,12 +45,12 @@ class Gradients(NamedTuple):
     theta: np.ndarray  # (workers, n) float32
     density: np.ndarray  # (workers, F + 1) float32
     basis: np.ndarray  # (N, 3, F) float32, of each ray; (workers, 3, F) where all rays share one basis
-    motion: np.ndarray | None  # (workers, T, Nz, Ny, Nx, 3) float32; None where there is no motion grid
+    motion: np.ndarray  # (workers, T, Nz, Ny, Nx, 3) float32
     wants_motion: bool  # whether the gradient of the motion grid is computed, which takes a fifth of the time
 
 
 class SampleArrays(NamedTuple):
-    """Samples of a batch of rays, ray by ray, as `collect_samples` writes them."""
+    """Samples of a batch of rays, ray by ray, as `collect_samples` writes them; with n = 0 it only counts them."""
 
     points: np.ndarray  # (n, 3) float32, u before displacement
     s: np.ndarray  # (n,) float32

@@ -4,10 +4,10 @@ import numpy as np
 from numba import prange
 
 from kpc.encoder.field.kernels.arguments import Gradients
-from kpc.encoder.field.kernels.compilation import bare, inlined, parallel, plain
+from kpc.encoder.field.kernels.compilation import bare, inlined, parallel
 from kpc.encoder.field.kernels.geometry import cell_index
 from kpc.encoder.field.kernels.marching import LIMIT, NEGLIGIBLE, march_ray, new_ray_buffers, shade_ray
-from kpc.encoder.field.kernels.planes import clear_slopes, scatter_motion, scatter_planes
+from kpc.encoder.field.kernels.planes import scatter_motion, scatter_planes
 
 
 @bare
@@ -56,7 +56,7 @@ def backpropagate_ray(planes, density, basis, buffers, count, trans, g_rgb, g_ba
         count, trans: what `march_ray` returned.
         g_rgb: d loss / d C, three numbers.
         g_background: trans * g_rgb . background.
-        gradients: `Gradients` of this worker and ray: (n,), (F + 1,), (3, F), (T, Nz, Ny, Nx, 3) or None.
+        gradients: `Gradients` of this worker and ray: (n,), (F + 1,), (3, F), (T, Nz, Ny, Nx, 3).
         peaks: (Nz, Ny, Nx), raised to the weights of the samples in each cell.
     """
     behind = g_background  # d loss / d C times the colour that comes from behind sample k
@@ -83,15 +83,9 @@ def backpropagate_ray(planes, density, basis, buffers, count, trans, g_rgb, g_ba
             gradients.density,
             gradients.basis,
         )
-        clear_slopes(planes.motion, buffers.slopes)
         scatter_planes(planes, gradients.theta, buffers.g_features, buffers, k, gradients.wants_motion)
-        scatter_motion(gradients.motion, buffers, k, gradients.wants_motion)
-
-
-@plain
-def row_or_none(array, row):
-    """Return array[row], or None of None."""
-    return None if array is None else array[row]
+        if gradients.wants_motion:
+            scatter_motion(gradients.motion, buffers, k)
 
 
 @parallel
@@ -147,7 +141,7 @@ def backpropagate(planes, density, volume, rays, basis, targets, distortion, gra
                 gradients.theta[worker],
                 gradients.density[worker],
                 gradients.basis[worker] if shared else gradients.basis[i],
-                row_or_none(gradients.motion, worker),
+                gradients.motion[worker],
                 gradients.wants_motion,
             )
             backpropagate_ray(planes, density, b, buffers, count, trans, g_rgb, g_background, own, peaks[worker])

@@ -1,6 +1,6 @@
 """Rays, occupancy cells, and displacement by the motion grid.
 
-`uniform_distance` is that of `kpc.format.scene.space.Contraction`, or None where the scene is its box.
+`uniform_distance` is that of `kpc.format.scene.space.Contraction`, or 0 where the scene is its box.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ def box_span(origin, direction, aabb):
 @inlined
 def ray_span(origin, direction, aabb, uniform_distance):
     """Return the s between which a ray takes samples."""
-    if uniform_distance is None:
+    if uniform_distance == 0:
         return box_span(origin, direction, aabb)
     return np.float32(0.0), np.float32(2.0 - 1.0 / FAR) * uniform_distance
 
@@ -42,7 +42,7 @@ def ray_span(origin, direction, aabb, uniform_distance):
 @inlined
 def ray_distance(s, uniform_distance):
     """Return the distance along the ray at s: `Contraction.distance`."""
-    if uniform_distance is None:
+    if uniform_distance == 0:
         return s
     return s if s <= uniform_distance else uniform_distance / (np.float32(2.0) - s / uniform_distance)
 
@@ -56,19 +56,27 @@ def inverse_edges(aabb):
 
 @inlined
 def ray_point(origin, direction, t, aabb, inverse, uniform_distance):
-    """Return u at distance t of a ray, and `Contraction.density_scale` there; `inverse` as from `inverse_edges`."""
+    """Return u at distance t of a ray, and what `density_scale` takes; `inverse` as from `inverse_edges`."""
     u = (origin[0] + t * direction[0] - aabb[0, 0]) * inverse[0]
     v = (origin[1] + t * direction[1] - aabb[0, 1]) * inverse[1]
     w = (origin[2] + t * direction[2] - aabb[0, 2]) * inverse[2]
     one = np.float32(1.0)
-    if uniform_distance is None:
+    if uniform_distance == 0:
         return u, v, w, one
     x, y, z = np.float32(2.0) * u - one, np.float32(2.0) * v - one, np.float32(2.0) * w - one
     radius = max(max(abs(x), abs(y), abs(z)), one)
     scale = np.float32(0.25) * (np.float32(2.0) - one / radius) / radius
-    root = max(t / uniform_distance, one) / radius
     half = np.float32(0.5)
-    return x * scale + half, y * scale + half, z * scale + half, root * root
+    return x * scale + half, y * scale + half, z * scale + half, radius
+
+
+@inlined
+def density_scale(t, radius, uniform_distance):
+    """Return `Contraction.density_scale` at distance t of a ray; `radius` as from `ray_point`."""
+    if uniform_distance == 0:
+        return np.float32(1.0)
+    root = max(t / uniform_distance, np.float32(1.0)) / radius
+    return root * root
 
 
 @inlined
@@ -112,7 +120,7 @@ def motion_corner(i, ft, fz, fy, fx):
 @inlined
 def displace(motion, u, v, w, time):
     """Return u + D(u, time), `kpc.format.scene.motion.displace`; `texel_and_fraction` clamps it to [0, 1] later."""
-    if motion is None:
+    if motion.shape[0] == 0:
         return u, v, w
     t, z, y, x, ft, fz, fy, fx = motion_cell(motion, u, v, w, time)
     for i in range(16):

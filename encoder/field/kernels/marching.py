@@ -7,7 +7,14 @@ from numba import prange
 
 from kpc.encoder.field.kernels.arguments import RayBuffers
 from kpc.encoder.field.kernels.compilation import bare, inlined, parallel, plain
-from kpc.encoder.field.kernels.geometry import cell_index, inverse_edges, ray_distance, ray_point, ray_span
+from kpc.encoder.field.kernels.geometry import (
+    cell_index,
+    density_scale,
+    inverse_edges,
+    ray_distance,
+    ray_point,
+    ray_span,
+)
 from kpc.encoder.field.kernels.planes import combine_planes, dot, sample_displaced
 from kpc.format.container.scene_layout import SAMPLE_LIMIT
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION
@@ -79,12 +86,13 @@ def march_ray(planes, density, volume, origin, direction, time, jitter, buffers)
         if not s < far:
             break
         t = ray_distance(s, volume.uniform_distance)
-        u, v, w, scale = ray_point(origin, direction, t, volume.aabb, inverse, volume.uniform_distance)
+        u, v, w, radius = ray_point(origin, direction, t, volume.aabb, inverse, volume.uniform_distance)
         if occupied[cell_index(occupied, u, v, w)] == 0:
             continue
         sample_displaced(planes, u, v, w, time, buffers, count)
         combine_planes(buffers.values[count], planes.table.shape[0], planes.channels, buffers.features[count])
         log_density = decode_density(buffers.features[count], density)
+        scale = density_scale(t, radius, volume.uniform_distance)
         tau = math.exp(log_density) * (volume.step * scale) / volume.extent
         alpha = np.float32(1.0) - math.exp(-tau)
         buffers.s[count], buffers.log_densities[count], buffers.taus[count] = s, log_density, tau
@@ -157,7 +165,7 @@ def render(planes, density, volume, rays, basis, capacity, workers):
 
 @inlined
 def collect_ray(volume, origin, direction, time, jitter, start, out):
-    """Write the occupied samples of one ray to `out` from `start` on, unless it is None; return their number."""
+    """Write the occupied samples of one ray to `out` from `start` on, as far as it reaches; return their number."""
     near, far = ray_span(origin, direction, volume.aabb, volume.uniform_distance)
     slots = volume.occupancy.shape[0]
     occupied = volume.occupancy[min(int(time * slots), slots - 1)]
@@ -169,14 +177,14 @@ def collect_ray(volume, origin, direction, time, jitter, start, out):
         if not s < far:
             break
         t = ray_distance(s, volume.uniform_distance)
-        u, v, w, scale = ray_point(origin, direction, t, volume.aabb, inverse, volume.uniform_distance)
+        u, v, w, radius = ray_point(origin, direction, t, volume.aabb, inverse, volume.uniform_distance)
         cell = cell_index(occupied, u, v, w)
         if occupied[cell] == 0:
             continue
-        if out is not None:
-            n = start + count
+        n = start + count
+        if n < out.s.size:
             out.points[n, 0], out.points[n, 1], out.points[n, 2] = u, v, w
-            out.s[n], out.density_scale[n] = s, scale
+            out.s[n], out.density_scale[n] = s, density_scale(t, radius, volume.uniform_distance)
             out.cells[n, 0], out.cells[n, 1], out.cells[n, 2] = cell
         count += 1
     return count
@@ -190,7 +198,7 @@ def collect_samples(volume, rays, starts, out, workers):
         volume: `Volume`; its extent is not used.
         rays: `RayBatch`; their backgrounds are not used.
         starts: (N,) int64, where in `out` the samples of each ray begin.
-        out: `SampleArrays` to be filled, or None to count only.
+        out: `SampleArrays` to be filled.
         workers: parts into which the rays are divided.
 
     Returns:

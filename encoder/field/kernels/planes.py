@@ -131,10 +131,8 @@ def add_slopes(low, high, fc, fr, per_column, per_row, g, along, across):
 
 
 @inlined
-def add_plane_slopes(motion, planes, s, c, corner, fc, fr, g, slopes):
-    """Add the gradient with respect to u by way of plane c of scale s; nothing where there is no motion grid."""
-    if motion is None:
-        return
+def add_plane_slopes(planes, s, c, corner, fc, fr, g, slopes):
+    """Add the gradient with respect to u by way of plane c of scale s."""
     theta, M = planes.theta, planes.channels
     columns, rows = planes.resolution[s, COLUMN_AXIS[c]], planes.resolution[s, ROW_AXIS[c]]
     low, high = theta[corner : corner + 2 * M], theta[corner + columns * M : corner + (columns + 2) * M]
@@ -151,8 +149,10 @@ def add_plane_slopes(motion, planes, s, c, corner, fc, fr, g, slopes):
 def scatter_planes(planes, g_theta, g_features, buffers, k, wants_slopes):
     """Add d loss / d theta of sample k, given g_features (F,) = d loss / d features.
 
-    buffers.slopes[axis M :][:M], if wanted, gains d loss / d u along that axis by channel.
+    buffers.slopes[axis M :][:M], if wanted, is set to d loss / d u along that axis by channel.
     """
+    if wants_slopes:
+        buffers.slopes[:] = np.float32(0.0)
     table, resolution, M = planes.table, planes.resolution, planes.channels
     corners, fractions, values, g_values = buffers.corners[k], buffers.fractions[k], buffers.values[k], buffers.g_values
     for s in range(table.shape[0]):
@@ -165,29 +165,19 @@ def scatter_planes(planes, g_theta, g_features, buffers, k, wants_slopes):
             g = g_values[c * M : (c + 1) * M]
             scatter_texels(low, high, w00, w01, w10, w11, g)
             if wants_slopes:
-                add_plane_slopes(planes.motion, planes, s, c, corner, fc, fr, g, buffers.slopes)
+                add_plane_slopes(planes, s, c, corner, fc, fr, g, buffers.slopes)
 
 
 @inlined
-def clear_slopes(motion, slopes):
-    """Set the slopes to 0 where there is a motion grid."""
-    if motion is not None:
-        slopes[:] = np.float32(0.0)
-
-
-@inlined
-def scatter_motion(g_motion, buffers, k, wanted):
-    """Add the gradient of the motion grid by sample k, given its slopes; nothing where there is no motion grid."""
-    if g_motion is None:
-        return
-    if wanted:
-        point, ones, g_point = buffers.points[k], buffers.ones, buffers.g_point
-        M = ones.size
-        for axis in range(3):
-            clamped = point[axis] < np.float32(0.0) or point[axis] > np.float32(1.0)
-            slope = dot(buffers.slopes[axis * M : (axis + 1) * M], ones, M)
-            g_point[axis] = np.float32(0.0) if clamped else slope
-        scatter_displacement(g_motion, point[4], point[5], point[6], point[3], g_point)
+def scatter_motion(g_motion, buffers, k):
+    """Add the gradient of the motion grid by sample k, given its slopes."""
+    point, ones, g_point = buffers.points[k], buffers.ones, buffers.g_point
+    M = ones.size
+    for axis in range(3):
+        clamped = point[axis] < np.float32(0.0) or point[axis] > np.float32(1.0)
+        slope = dot(buffers.slopes[axis * M : (axis + 1) * M], ones, M)
+        g_point[axis] = np.float32(0.0) if clamped else slope
+    scatter_displacement(g_motion, point[4], point[5], point[6], point[3], g_point)
 
 
 @inlined

@@ -5,13 +5,7 @@ from numba import prange
 
 from kpc.encoder.field.kernels.compilation import parallel
 from kpc.encoder.field.kernels.marching import decode_density, new_ray_buffers
-from kpc.encoder.field.kernels.planes import (
-    clear_slopes,
-    combine_planes,
-    sample_displaced,
-    scatter_motion,
-    scatter_planes,
-)
+from kpc.encoder.field.kernels.planes import combine_planes, sample_displaced, scatter_motion, scatter_planes
 
 
 @parallel
@@ -49,14 +43,13 @@ def scatter_features(planes, g_theta, g_motion, points, times, g):
 
     Args:
         g_theta: (workers, n) float32, a buffer for each worker.
-        g_motion: (workers, T, Nz, Ny, Nx, 3) float32, or None where there is no motion grid.
+        g_motion: (workers, T, Nz, Ny, Nx, 3) float32, the same of the motion grid.
     """
-    N, workers = points.shape[0], g_theta.shape[0]
+    N, workers, wants_motion = points.shape[0], g_theta.shape[0], g_motion.size > 0
     for worker in prange(workers):
         buffers = new_ray_buffers(planes.table, planes.channels, 1)
         for i in range(worker * N // workers, (worker + 1) * N // workers):
             sample_displaced(planes, points[i, 0], points[i, 1], points[i, 2], times[i], buffers, 0)
-            clear_slopes(planes.motion, buffers.slopes)
-            scatter_planes(planes, g_theta[worker], g[i], buffers, 0, True)
-            if g_motion is not None:
-                scatter_motion(g_motion[worker], buffers, 0, True)
+            scatter_planes(planes, g_theta[worker], g[i], buffers, 0, wants_motion)
+            if wants_motion:
+                scatter_motion(g_motion[worker], buffers, 0)
