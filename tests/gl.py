@@ -50,7 +50,7 @@ def evaluate(
         + "uniform sampler3D grid;\n" * (grid is not None)
         + glsl
     )
-    program = shader.build(ctx, "main", {"CONTRACTED": 0, "NDC": 0, **defines},
+    program = shader.build(ctx, "main", {"CONTRACTED": 0, "NDC": 0, "COUNTED": 0, **defines},
                            {"main": f"{text}\nout vec4 o;\nvoid main() {{ {fetch} o = {expression}; }}\n"})  # fmt: skip
     textures = [ctx.texture(size, 4, np.ascontiguousarray(array, np.float32), dtype="f4") for array in inputs]
     for unit, (name, texture) in enumerate(zip(names, textures, strict=True)):

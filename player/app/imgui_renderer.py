@@ -9,7 +9,7 @@ from kpc.player.app.desktop import imgui
 from kpc.player.app.widgets import ACCENT
 from kpc.player.gl import shader
 
-_VERTEX = f"""{shader.GL33}
+_VERTEX = f"""{shader.Language.DESKTOP.value}
 uniform vec2 display;
 in vec2 position;
 in vec2 uv;
@@ -22,7 +22,7 @@ void main() {{
     gl_Position = vec4(position.x / display.x * 2.0 - 1.0, 1.0 - position.y / display.y * 2.0, 0.0, 1.0);
 }}
 """
-_FRAGMENT = f"""{shader.GL33}
+_FRAGMENT = f"""{shader.Language.DESKTOP.value}
 uniform sampler2D sheet;
 in vec2 texture_position;
 in vec4 tint;

@@ -5,6 +5,7 @@ from typing import Any
 import moderngl
 
 from kpc.format.common.errors import DisplayError
+from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player.atlas import Layout
 from kpc.player.gl import shader
@@ -57,15 +58,7 @@ class Programs:
         if key in self._programs:
             return self._programs[key]
         scene = self._textures.scene
-        macros = {
-            **planes_shape(layout),
-            **decoder_shape(scene.decoder),
-            "APPEARANCE": int(bool(scene.appearances)),
-            "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
-            "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
-            "COMPUTE": int(compute),
-            **defines,
-        }
+        macros = {**scene_defines(scene, layout), "COMPUTE": int(compute), "COUNTED": 0, **defines}
         written = {"decoder_weights": self._decoder, "plane_blocks": shader.constants(block_arrays(scene, layout))}
         program: AnyProgram
         vertices = None
@@ -105,6 +98,17 @@ class Programs:
                 vertices.release()
             program.release()
         self._programs.clear()
+
+
+def scene_defines(scene: Scene, layout: Layout) -> dict[str, int]:
+    """Return the macros that describe a scene whose planes lie in a layout."""
+    return {
+        **planes_shape(layout),
+        **decoder_shape(scene.decoder),
+        "APPEARANCE": int(bool(scene.appearances)),
+        "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
+        "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
+    }
 
 
 def draw(

@@ -1,13 +1,16 @@
 """Puts GLSL files together: preamble, `#include`s, `#unroll`s, `#line`, and compiler messages that name the file they
 mean.
 
-The files in `player/gl/glsl` hold no `#version`, so that one set serves desktop OpenGL 3.3 and WebGL2. They are written
-in the subset that both understand (GLSL ES 3.00).
+The files in `player/gl/glsl` hold no `#version`, so that one set serves every `Language`. They are written in the
+subset that desktop OpenGL 3.3 and WebGL2 both understand, GLSL ES 3.00. What a shader does is known only with its scene
+(how many layers, which weights), so a browser composes them, too: `player/web/src/render/shader.ts` reads the same
+files, and a test holds both composers to the same text.
 """
 
 import contextlib
 import re
 from collections.abc import Iterator, Mapping
+from enum import Enum
 from importlib import resources
 
 import moderngl
@@ -15,14 +18,19 @@ import numpy as np
 
 from kpc.format.common.errors import DisplayError
 
-GL33 = "#version 330 core"
-GL43 = "#version 430 core"
-ES30 = """#version 300 es
+
+class Language(Enum):
+    """What a shader is composed for; the value is what the text begins with."""
+
+    DESKTOP = "#version 330 core"
+    DESKTOP_COMPUTE = "#version 430 core"
+    WEB = """#version 300 es
 precision highp float;
 precision highp int;
 precision highp sampler2D;
 precision highp sampler3D;
 precision highp usampler3D;"""
+
 
 LINES_A_FILE = 10000
 
@@ -33,7 +41,10 @@ _WHERE = re.compile(r"(?:ERROR:\s*)?\b\d+[:(](\d+)\)?(?:\(\d+\))?\s*:\s*(?:error
 
 
 def compose(
-    name: str, defines: Mapping[str, int] | None = None, preamble: str = GL33, written: Mapping[str, str] | None = None
+    name: str,
+    defines: Mapping[str, int] | None = None,
+    language: Language = Language.DESKTOP,
+    written: Mapping[str, str] | None = None,
 ) -> tuple[str, list[str]]:
     """The whole text of the shader `name`, and the names of the files in it.
 
@@ -50,7 +61,7 @@ def compose(
     """
     files: list[str] = []
     macros = "".join(f"#define {key} {value}\n" for key, value in (defines or {}).items())
-    return f"{preamble}\n{macros}" + _expand(name, files, written or {}, defines or {}), files
+    return f"{language.value}\n{macros}" + _expand(name, files, written or {}, defines or {}), files
 
 
 def _expand(name: str, files: list[str], written: Mapping[str, str], defines: Mapping[str, int]) -> str:
@@ -134,7 +145,7 @@ def build_compute(
     Raises:
         DisplayError: as `build`.
     """
-    text, files = compose(name, defines, GL43, written)
+    text, files = compose(name, defines, Language.DESKTOP_COMPUTE, written)
     with _errors_with_file_names(ctx, files):
         return ctx.compute_shader(text)
 

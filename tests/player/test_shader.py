@@ -66,7 +66,7 @@ def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
     scene = tiny_scene(0)
     defines = {**planes_shape(Layout.of(scene)), **decoder_shape(scene.decoder)}
     text, files = shader.compose(
-        name, defines, written={"decoder_weights": "", "plane_blocks": ""}, preamble=shader.ES30
+        name, defines, written={"decoder_weights": "", "plane_blocks": ""}, language=shader.Language.WEB
     )
     assert text.startswith("#version 300 es\n") and text.count("#version") == 1
     assert len(set(files)) == len(files)
@@ -117,9 +117,18 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
     blocks = shader.constants(block_arrays(scene, layout))
-    defines = {"ROWS": rows, "MODE": rows + 2 * motion, "MOTION": motion, "APPEARANCE": rows, "COMPUTE": 0}
+    defines = {
+        "ROWS": rows,
+        "MODE": rows + 2 * motion,
+        "MOTION": motion,
+        "APPEARANCE": rows,
+        "COMPUTE": 0,
+        "COUNTED": motion,
+    }
     defines |= {"CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc")}
     defines |= {**planes_shape(layout), **decoder_shape(scene.decoder)}
-    fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights, "plane_blocks": blocks})
-    vertex, _ = shader.compose("fullscreen.glsl", defines, preamble=shader.ES30)
+    fragment, _ = shader.compose(
+        name, defines, shader.Language.WEB, {"decoder_weights": weights, "plane_blocks": blocks}
+    )
+    vertex, _ = shader.compose("fullscreen.glsl", defines, language=shader.Language.WEB)
     ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()

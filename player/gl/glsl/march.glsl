@@ -5,7 +5,7 @@
 // HYBRID: 1 for the hybrid decoder, of layers of WIDTH and HIDDEN units. APPEARANCE: 1 where colours come in more than
 // one appearance. ROWS: 1 where time rows are multiplied in at every sample. CONTRACTED: 1 where the planes hold what
 // lies outside the box, too. MOTION: 1 where samples are displaced. NDC: 1 where all this is in normalised device
-// coordinates. COMPUTE: 1 for a compute shader (GL 4.3).
+// coordinates. COMPUTE: 1 for a compute shader (GL 4.3). COUNTED: 1 where look-ups of cells are counted.
 
 #include "ray.glsl"
 #include "space.glsl"
@@ -207,7 +207,8 @@ void add_sample(inout Sums sums, vec4 logits, float thickness, float distance) {
     sums.samples += 1.0;
 }
 
-// rgba: colour and opacity; depth_samples: sum of weight times distance, number of samples.
+// rgba: colour and opacity; depth_samples: sum of weight times distance, number of samples and, COUNTED, of cells looked
+// up.
 void march(vec2 fragment, out vec4 rgba, out vec4 depth_samples) {
     Path path = path_of(eye, camera_direction(fragment, height, lens, axes), frame, near, baseline);
     Walk walk = walk_of(path.origin, path.direction, box_low, box_high, cell_count, stride, uniform_distance);
@@ -242,6 +243,9 @@ void march(vec2 fragment, out vec4 rgba, out vec4 depth_samples) {
     }
     rgba = vec4(sums.rgb + sums.trans * background, 1.0 - sums.trans);
     depth_samples = vec4(sums.depth, sums.samples, 0.0, 0.0);
+#if COUNTED
+    depth_samples.z = cell_look_ups;
+#endif
 }
 
 #if COMPUTE

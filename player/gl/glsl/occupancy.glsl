@@ -56,8 +56,15 @@ vec3 cell_of(Walk walk, vec3 u) {
     return clamp(floor(u * walk.count), vec3(0.0), walk.count - 1.0);
 }
 
+#if COUNTED
+float cell_look_ups = 0.0;
+#endif
+
 // What a cell holds. By filter: much cheaper than texelFetch where a processor draws.
 uint free_around(usampler3D cells, Walk walk, vec3 cell) {
+#if COUNTED
+    cell_look_ups += 1.0;
+#endif
     return textureLod(cells, (cell + 0.5) * walk.edge, 0.0).r;
 }
 

@@ -8,6 +8,7 @@ uniform sampler2D rgba;
 uniform sampler2D sums;
 uniform sampler2D static_rgba;
 uniform vec2 viewport;      // pixels
+uniform vec2 origin;        // of the viewport on the screen, pixels
 uniform vec2 depths;        // shown from bright to dark, world units
 uniform float uniform_distance;         // CONTRACTED: how far along a ray samples are evenly spaced
 uniform float most_samples;
@@ -21,7 +22,7 @@ vec3 heat(float x) {
 }
 
 void main() {
-    vec2 at = gl_FragCoord.xy / viewport;
+    vec2 at = (gl_FragCoord.xy - origin) / viewport;
     vec4 colour = texture(rgba, at);
     vec3 rgb = colour.rgb;
 #if MODE == 1
