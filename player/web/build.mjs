@@ -1,6 +1,7 @@
 /**
  * Builds the player: `node build.mjs` writes dist/, `node build.mjs --test [NAME ...]` runs all tests or those,
- * `node build.mjs --out FOLDER` writes to another folder.
+ * `node build.mjs --out FOLDER` writes to another folder, `node build.mjs --page FILE --out FOLDER` bundles a script of a
+ * page that tests open.
  *
  * Everything is inlined: the decoder core (format/core), the shaders (player/gl/glsl), the schema of metadata (spec),
  * and the text of the worker, which `import source from './worker.ts?text'` bundles. Nothing is copied.
@@ -79,9 +80,19 @@ async function test(names) {
     .status;
 }
 
+/** Bundle a script of a page. */
+async function buildPage(file, outdir) {
+  await esbuild.build({ ...OPTIONS, entryPoints: [file], format: 'iife', outdir, plugins: [bundledText] });
+}
+
 const { values, positionals } = parseArgs({
-  options: { test: { type: 'boolean' }, out: { type: 'string', default: join(FOLDER, 'dist') } },
+  options: {
+    test: { type: 'boolean' },
+    page: { type: 'string' },
+    out: { type: 'string', default: join(FOLDER, 'dist') },
+  },
   allowPositionals: true,
 });
 if (values.test) process.exitCode = await test(positionals);
+else if (values.page) await buildPage(values.page, resolve(values.out));
 else await build(resolve(values.out));

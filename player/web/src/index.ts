@@ -22,3 +22,7 @@ export { type Part, type Span, Timeline } from './container/timeline.js';
 export { Core, type SegmentSymbols } from './decoder/core.js';
 export { loadCore } from './decoder/module.js';
 export { DecoderPool, type PoolOptions } from './decoder/pool.js';
+export { RenderError } from './render/device.js';
+export type { DrawnScene } from './render/drawn_scene.js';
+export { LEVEL_NAMES, type Level } from './render/quality.js';
+export { type DrawnPicture, type DrawOptions, type Moment, Renderer, type ShownPart } from './render/renderer.js';

@@ -5,7 +5,7 @@
  *
  * `not-found` the server has no such file; `blocked` another site's server does not permit it (CORS); `replaced` the
  * file changed while it was read; `network` the server cannot be reached or its answer not be used; `worker` the
- * decoder cannot run; `aborted` the caller ended it.
+ * decoder cannot run; `aborted` the caller ended it; `no-webgl` there is no WebGL2; `graphics` the card cannot draw it.
  */
 export type ErrorCode =
   | 'foreign'
@@ -20,7 +20,9 @@ export type ErrorCode =
   | 'replaced'
   | 'network'
   | 'worker'
-  | 'aborted';
+  | 'aborted'
+  | 'no-webgl'
+  | 'graphics';
 
 /** Base class of all errors that this package raises on purpose. */
 export class KpcError extends Error {

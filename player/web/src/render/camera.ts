@@ -1,0 +1,45 @@
+/** Cameras to draw from, and how many texels of a scene a pixel of one spans. */
+
+import { extentOf, headOf, type SceneSource, SPACE_PLANES } from './scene_source.js';
+
+/** A pinhole camera, lengths in pixels; `pose` is camera to world, 3 rows of 4 numbers: right, up, backward, place. */
+export interface Camera {
+  width: number;
+  height: number;
+  focal: ArrayLike<number>;
+  centre: ArrayLike<number>;
+  pose: ArrayLike<number>;
+}
+
+/** Return the same view at another size; each axis is scaled independently. */
+export function resized(camera: Camera, width: number, height: number): Camera {
+  const [x, y] = [width / camera.width, height / camera.height];
+  const [focal, centre] = [camera.focal, camera.centre].map((lens) => [lens[0] * x, lens[1] * y]);
+  return { width, height, focal, centre, pose: camera.pose };
+}
+
+/** Return whether two cameras see the same picture. */
+export function isSameView(a: Camera, b: Camera): boolean {
+  const numbers = ({ width, height, focal, centre, pose }: Camera) =>
+    [width, height, focal[0], focal[1], centre[0], centre[1], ...Array.from(pose)].map(Math.fround);
+  const others = numbers(b);
+  return numbers(a).every((x, i) => x === others[i]);
+}
+
+/** Return the columns of a pose, as a shader takes them: right, up, backward, place. */
+export function columnsOf(pose: ArrayLike<number>): number[] {
+  return [0, 1, 2, 3].flatMap((column) => [pose[column], pose[column + 4], pose[column + 8]]);
+}
+
+/** Return how many texels of the finest scale a pixel spans in the middle of the box of an unmapped scene. */
+export function texelsPerPixel(scene: SceneSource, camera: Camera): number {
+  const { aabb, scales } = scene.head;
+  const place = columnsOf(camera.pose).slice(9);
+  const distance = Math.hypot(...place.map((x, axis) => (aabb[axis] + aabb[axis + 3]) / 2 - x));
+  const finest = scales[scales.length - 1];
+  const across = SPACE_PLANES.map((name) => headOf(finest, name)).flatMap(({ columns, rows }) => [
+    columns - 1,
+    rows - 1,
+  ]);
+  return distance / Math.min(camera.focal[0], camera.focal[1]) / (extentOf(scene) / Math.max(1, ...across));
+}

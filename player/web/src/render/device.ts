@@ -1,0 +1,282 @@
+/** WebGL2: what it can do, and the objects made of it, which are counted so that nothing is left behind. */
+
+import { KpcError } from '../container/errors.js';
+import { compose, type Defines, firstError, type Written } from './shader.js';
+
+/** This browser or card cannot draw a scene; the message says why, for people. */
+export class RenderError extends KpcError {
+  override name = 'RenderError';
+
+  constructor(message: string, code: 'no-webgl' | 'graphics' = 'graphics') {
+    super(message, code);
+  }
+}
+
+/** How numbers of a texture are kept. */
+export type Format = 'rgba32f' | 'rgba16f' | 'rgba8' | 'rg32f' | 'rg16f' | 'r8ui';
+
+export interface Texture {
+  readonly handle: WebGLTexture;
+  readonly format: Format;
+  readonly size: readonly number[]; // width, height and, of a volume, depth
+}
+
+export interface Framebuffer {
+  readonly handle: WebGLFramebuffer;
+  readonly width: number;
+  readonly height: number;
+}
+
+export interface Program {
+  readonly handle: WebGLProgram;
+  /** Where uniforms are, by their names; compilers drop unused ones. */
+  readonly uniforms: ReadonlyMap<string, { type: number; location: WebGLUniformLocation }>;
+}
+
+const BYTES: Record<Format, number> = { rgba32f: 16, rgba16f: 8, rgba8: 4, rg32f: 8, rg16f: 4, r8ui: 1 };
+
+export const bytesOf = ({ format, size }: Texture): number => BYTES[format] * size.reduce((a, b) => a * b);
+
+export class Device {
+  readonly maxTextureSize: number;
+  readonly maxVolumeSize: number;
+  /** Whether float32 textures can be filtered; many telephones filter float16 only. */
+  readonly filtersFloat32: boolean;
+  /** Whether float32 textures can be drawn to; otherwise float16. */
+  readonly drawsFloat32: boolean;
+  #objects = 0;
+  readonly #vertices: WebGLVertexArrayObject;
+
+  constructor(
+    readonly gl: WebGL2RenderingContext,
+    { halfFloat = false }: { halfFloat?: boolean } = {},
+  ) {
+    const drawsFloat32 = gl.getExtension('EXT_color_buffer_float') !== null;
+    if (!drawsFloat32 && gl.getExtension('EXT_color_buffer_half_float') === null) {
+      throw new RenderError('WebGL2 of this browser cannot draw to textures of float numbers; use another', 'no-webgl');
+    }
+    this.drawsFloat32 = drawsFloat32 && !halfFloat;
+    this.filtersFloat32 = gl.getExtension('OES_texture_float_linear') !== null && !halfFloat;
+    this.maxTextureSize = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    this.maxVolumeSize = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
+    this.#vertices = this.#made(gl.createVertexArray());
+  }
+
+  /** The objects that are there at present. */
+  get objects(): number {
+    return this.#objects;
+  }
+
+  /** What draws: the name of the card and its driver, as far as the browser tells it. */
+  get name(): string {
+    const { gl } = this;
+    const info = gl.getExtension('WEBGL_debug_renderer_info');
+    return String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+  }
+
+  texture(format: Format, size: readonly number[], isFiltered: boolean): Texture {
+    const { gl } = this;
+    const handle = this.#made(gl.createTexture());
+    const target = size.length === 3 ? gl.TEXTURE_3D : gl.TEXTURE_2D;
+    gl.bindTexture(target, handle);
+    const [width, height, depth] = size;
+    const kept = this.#formats(format)[0];
+    if (target === gl.TEXTURE_3D) gl.texStorage3D(target, 1, kept, width, height, depth);
+    else gl.texStorage2D(target, 1, kept, width, height);
+    const filter = isFiltered ? gl.LINEAR : gl.NEAREST;
+    gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, filter);
+    gl.texParameteri(target, gl.TEXTURE_MAG_FILTER, filter);
+    for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T, gl.TEXTURE_WRAP_R]) {
+      gl.texParameteri(target, side, gl.CLAMP_TO_EDGE);
+    }
+    return { handle, format, size };
+  }
+
+  /** Replace a part of a texture, all of it or the rectangle of `size` texels at (x, y); Uint16 are halves. */
+  write(
+    texture: Texture,
+    values: Uint8Array | Uint16Array | Float32Array,
+    x = 0,
+    y = 0,
+    size: readonly number[] = texture.size,
+  ): void {
+    const { gl } = this;
+    const [, layout] = this.#formats(texture.format);
+    const type =
+      values instanceof Uint16Array ? gl.HALF_FLOAT : values instanceof Uint8Array ? gl.UNSIGNED_BYTE : gl.FLOAT;
+    this.#resetUnpacking();
+    if (texture.size.length === 3) {
+      gl.bindTexture(gl.TEXTURE_3D, texture.handle);
+      gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, 0, size[0], size[1], size[2], layout, type, values);
+    } else {
+      gl.bindTexture(gl.TEXTURE_2D, texture.handle);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, x, y, size[0], size[1], layout, type, values);
+    }
+  }
+
+  use(texture: Texture, unit: number): void {
+    const { gl } = this;
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(texture.size.length === 3 ? gl.TEXTURE_3D : gl.TEXTURE_2D, texture.handle);
+  }
+
+  framebuffer(textures: readonly Texture[]): Framebuffer {
+    const { gl } = this;
+    const handle = this.#made(gl.createFramebuffer());
+    const [width, height] = textures[0].size;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, handle);
+    textures.forEach((texture, i) => {
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + i, gl.TEXTURE_2D, texture.handle, 0);
+    });
+    gl.drawBuffers(textures.map((_, i) => gl.COLOR_ATTACHMENT0 + i));
+    return { handle, width, height };
+  }
+
+  /** Compile a fragment shader that is drawn over a whole viewport. */
+  program(name: string, defines: Defines, written: Written): Program {
+    const { gl } = this;
+    const handle = this.#made(gl.createProgram());
+    const stages = [
+      { type: gl.VERTEX_SHADER, ...compose('fullscreen.glsl') },
+      { type: gl.FRAGMENT_SHADER, ...compose(name, defines, written) },
+    ].map(({ type, text, files }) => {
+      const shader = gl.createShader(type) as WebGLShader;
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      gl.attachShader(handle, shader);
+      return { shader, files };
+    });
+    gl.linkProgram(handle);
+    const isLinked = gl.getProgramParameter(handle, gl.LINK_STATUS) || gl.isContextLost();
+    const failed = stages.find(({ shader }) => !gl.getShaderParameter(shader, gl.COMPILE_STATUS)) ?? stages[1];
+    const log = isLinked ? '' : gl.getShaderInfoLog(failed.shader) || gl.getProgramInfoLog(handle) || 'does not link';
+    for (const { shader } of stages) gl.deleteShader(shader);
+    if (!isLinked) {
+      this.release({ handle, uniforms: new Map() });
+      throw new RenderError(`${firstError(log, failed.files)} (driver: ${this.name}); update it`);
+    }
+    return { handle, uniforms: this.#uniforms(handle) };
+  }
+
+  /** Set the uniforms that a program has: whole numbers and samplers by number, all else by the length of its array. */
+  set(program: Program, values: Readonly<Record<string, number | boolean | ArrayLike<number>>>): void {
+    const { gl } = this;
+    gl.useProgram(program.handle);
+    for (const [name, value] of Object.entries(values)) {
+      const found = program.uniforms.get(name);
+      if (found === undefined) continue;
+      const { type, location } = found;
+      const numbers = typeof value === 'object' ? Float32Array.from(value) : Float32Array.of(Number(value));
+      if (type === gl.FLOAT) gl.uniform1fv(location, numbers);
+      else if (type === gl.FLOAT_VEC2) gl.uniform2fv(location, numbers);
+      else if (type === gl.FLOAT_VEC3) gl.uniform3fv(location, numbers);
+      else if (type === gl.FLOAT_VEC4) gl.uniform4fv(location, numbers);
+      else if (type === gl.FLOAT_MAT3) gl.uniformMatrix3fv(location, false, numbers);
+      else if (type === gl.FLOAT_MAT4x3) gl.uniformMatrix4x3fv(location, false, numbers);
+      else gl.uniform1i(location, Number(value));
+    }
+  }
+
+  /**
+   * Draw over a viewport of a framebuffer, null being the canvas.
+   * @param opacity share of what is drawn in the result; what is there keeps the rest.
+   * @param scissor the rectangle to draw, x, y, width and height; all if left out.
+   */
+  draw(
+    program: Program,
+    into: WebGLFramebuffer | null,
+    viewport: readonly [number, number, number, number],
+    { isBlended = false, scissor }: { isBlended?: boolean; scissor?: readonly [number, number, number, number] } = {},
+  ): void {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, into);
+    gl.viewport(...viewport);
+    for (const test of [gl.DEPTH_TEST, gl.STENCIL_TEST, gl.CULL_FACE, gl.BLEND, gl.SCISSOR_TEST]) gl.disable(test);
+    gl.colorMask(true, true, true, true);
+    if (isBlended) {
+      gl.enable(gl.BLEND);
+      gl.blendEquation(gl.FUNC_ADD);
+      gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    }
+    if (scissor !== undefined) {
+      gl.enable(gl.SCISSOR_TEST);
+      gl.scissor(...scissor);
+    }
+    gl.useProgram(program.handle);
+    gl.bindVertexArray(this.#vertices);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.bindVertexArray(null);
+    gl.disable(gl.BLEND);
+    gl.disable(gl.SCISSOR_TEST);
+  }
+
+  /** Read what a framebuffer holds of one of its textures: float RGBA, rows from below. */
+  read({ handle, width, height }: Framebuffer, attachment: number): Float32Array {
+    const { gl } = this;
+    const out = new Float32Array(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, handle);
+    gl.readBuffer(gl.COLOR_ATTACHMENT0 + attachment);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, out);
+    gl.readBuffer(gl.COLOR_ATTACHMENT0);
+    return out;
+  }
+
+  /** Delete an object. */
+  release(object: Texture | Framebuffer | Program): void {
+    const { gl } = this;
+    if ('format' in object) gl.deleteTexture(object.handle);
+    else if ('uniforms' in object) gl.deleteProgram(object.handle);
+    else gl.deleteFramebuffer(object.handle);
+    this.#objects--;
+  }
+
+  /** Delete what the device itself has made. */
+  dispose(): void {
+    this.gl.deleteVertexArray(this.#vertices);
+    this.#objects--;
+  }
+
+  #made<T>(object: T | null): T {
+    if (object === null) throw new RenderError('this browser has no more room for graphics; close other pages');
+    this.#objects++;
+    return object;
+  }
+
+  #uniforms(program: WebGLProgram): Map<string, { type: number; location: WebGLUniformLocation }> {
+    const { gl } = this;
+    const found = new Map<string, { type: number; location: WebGLUniformLocation }>();
+    const count = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS) ?? 0;
+    for (let i = 0; i < count; i++) {
+      const uniform = gl.getActiveUniform(program, i);
+      const location = uniform && gl.getUniformLocation(program, uniform.name);
+      if (uniform && location) found.set(uniform.name.replace(/\[0\]$/, ''), { type: uniform.type, location });
+    }
+    return found;
+  }
+
+  /** Undo what other code on the page may have set for uploads. */
+  #resetUnpacking(): void {
+    const { gl } = this;
+    gl.bindBuffer(gl.PIXEL_UNPACK_BUFFER, null);
+    for (const name of [gl.UNPACK_ROW_LENGTH, gl.UNPACK_IMAGE_HEIGHT, gl.UNPACK_SKIP_ROWS, gl.UNPACK_SKIP_PIXELS]) {
+      gl.pixelStorei(name, 0);
+    }
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.pixelStorei(gl.UNPACK_FLIP_Y_WEBGL, false);
+    gl.pixelStorei(gl.UNPACK_PREMULTIPLY_ALPHA_WEBGL, false);
+  }
+
+  /** Return the internal format of a texture, and the layout of what is written to it. */
+  #formats(format: Format): [number, number] {
+    const { gl } = this;
+    const known: Record<Format, [number, number]> = {
+      rgba32f: [gl.RGBA32F, gl.RGBA],
+      rgba16f: [gl.RGBA16F, gl.RGBA],
+      rgba8: [gl.RGBA8, gl.RGBA],
+      rg32f: [gl.RG32F, gl.RG],
+      rg16f: [gl.RG16F, gl.RG],
+      r8ui: [gl.R8UI, gl.RED_INTEGER],
+    };
+    return known[format];
+  }
+}

@@ -1,0 +1,137 @@
+/** A scene that is ready to be drawn. */
+
+import { type Camera, columnsOf } from './camera.js';
+import type { Device, Framebuffer } from './device.js';
+import { FoldedPlanes } from './folding.js';
+import type { Quality } from './quality.js';
+import { extentOf, type SceneSource } from './scene_source.js';
+import { Programs, SceneTextures } from './scene_textures.js';
+
+/** What of a scene to draw into a target. */
+export interface Shot {
+  camera: Camera; // of the target's size
+  time: number; // in [0, 1] over the scene
+  quality: Quality;
+  isMoving: boolean; // else the static part
+  appearance: Float32Array | null; // an embedding; null is the average appearance
+  background: ArrayLike<number>;
+  isCounted?: boolean; // whether look-ups of cells are counted, too
+}
+
+/** Texels that are uploaded before a frame, at most: a hundredth of a second on a slow telephone. */
+const BYTES_A_FRAME = 4 << 20;
+
+interface Parts {
+  device: Device;
+  textures: SceneTextures;
+  programs: Programs;
+  folded: FoldedPlanes | null;
+}
+
+export class DrawnScene {
+  readonly source: SceneSource;
+  #parts: Parts | null = null;
+  #uploads = 0;
+
+  constructor(source: SceneSource) {
+    this.source = source;
+  }
+
+  /** Changes whenever the picture may have changed. */
+  get version(): string {
+    return `${this.source.version} ${this.#uploads}`;
+  }
+
+  /** Upload rows of planes that have arrived, as many as a frame has time for. */
+  upload(device: Device): void {
+    const { textures, folded } = this.#on(device);
+    for (const rows of this.source.take(BYTES_A_FRAME)) {
+      textures.put(rows);
+      folded?.planesChanged();
+      this.#uploads++;
+    }
+  }
+
+  /** Make what drawing needs on a device, unless it is there. */
+  #on(device: Device): Parts {
+    if (this.#parts?.device === device) return this.#parts;
+    if (this.#parts !== null) this.source.restore(); // what was made for a device before went with it
+    const textures = new SceneTextures(device, this.source);
+    this.#parts = { device, textures, programs: new Programs(device, textures), folded: null };
+    return this.#parts;
+  }
+
+  /** March the rays of a target, or those of its rows from `firstRow` on, from below. */
+  march(device: Device, target: Framebuffer, shot: Shot, firstRow = 0, rowCount = target.height): void {
+    const parts = this.#on(device);
+    const { textures, programs } = parts;
+    const { head } = this.source;
+    const { camera, time, quality, appearance } = shot;
+    const isMoving = shot.isMoving && head.isDynamic;
+    const isFolded = isMoving && quality.folded;
+    const isDisplaced = isMoving && textures.motion !== null;
+    textures.setOccupancy(time);
+    if (isDisplaced) textures.setMotion(time);
+    let { planes, layout } = textures;
+    if (isFolded) {
+      parts.folded ??= new FoldedPlanes(textures, programs);
+      planes = parts.folded.at(time);
+      layout = parts.folded.layout;
+    } else if (isMoving) {
+      textures.setTimeRows(time);
+    }
+    const program = programs.get('march.glsl', layout, {
+      ROWS: Number(isMoving && !isFolded),
+      MOTION: Number(isDisplaced),
+      COUNTED: Number(shot.isCounted ?? false),
+    });
+    const stride = head.rayStep * quality.step;
+    const columns = columnsOf(camera.pose);
+    device.set(program, {
+      stride,
+      tau: stride / extentOf(this.source),
+      termination: quality.termination,
+      background: shot.background,
+      appearance: paddedCode(appearance, this.source.decoder.hidden),
+      height: camera.height,
+      lens: [camera.focal[0], camera.focal[1], camera.centre[0], camera.centre[1]],
+      axes: columns.slice(0, 9),
+      eye: columns.slice(9),
+    });
+    textures.bind(planes);
+    const { width, height } = target;
+    device.draw(program, target.handle, [0, 0, width, height], { scissor: [0, firstRow, width, rowCount] });
+  }
+
+  /** Texels that a sample looks up in planes and rows, and that folding looks up and writes for another time. */
+  get lookUps(): { perSample: (quality: Quality) => number; folding: number } {
+    const features = this.#parts?.textures.layout.features ?? 0;
+    const isDynamic = this.source.head.isDynamic;
+    return {
+      perSample: (quality) => features * (quality.folded || !isDynamic ? 3 : 6),
+      folding: this.#parts?.folded?.foldedTexels ?? 0,
+    };
+  }
+
+  /** Bytes of its textures. */
+  get memoryBytes(): number {
+    return (this.#parts?.textures.memoryBytes ?? 0) + (this.#parts?.folded?.memoryBytes ?? 0);
+  }
+
+  release(): void {
+    this.#parts?.folded?.release();
+    this.#parts?.programs.release();
+    this.#parts?.textures.release();
+    this.#parts = null;
+  }
+}
+
+/** Return an appearance's numbers as vec4s, padded with 0. */
+function paddedCode(code: Float32Array | null, hidden: number): Float32Array {
+  const padded = new Float32Array(4 * Math.ceil(hidden / 4));
+  if (code !== null) {
+    if (code.length !== hidden) throw new RangeError(`an appearance of ${code.length} numbers, not ${hidden}`);
+    padded.set(code);
+  }
+  return padded;
+}

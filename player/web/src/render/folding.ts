@@ -1,0 +1,104 @@
+/** Folding: once a frame, the time rows are multiplied into the space planes, as kpc.player.gl.folding explains. */
+
+import { isFoldedAlongRows, Layout, rowWidth, timeRows } from './atlas.js';
+import { bytesOf, type Device, type Framebuffer, type Texture } from './device.js';
+import { type Programs, type SceneTextures, UNIT } from './scene_textures.js';
+
+const UPSAMPLING = 2;
+const LARGEST_HALF = 65504;
+
+/** The planes of a dynamic scene at one time. */
+export class FoldedPlanes {
+  readonly layout: Layout;
+  readonly #device: Device;
+  readonly #upsampled: Texture;
+  readonly #rows: Texture;
+  readonly #planes: Texture;
+  readonly #upsampleInto: Framebuffer;
+  readonly #foldInto: Framebuffer;
+  /** Time and version of the folded planes. */
+  #folded = '';
+  #isUpsampled = false;
+
+  constructor(
+    readonly textures: SceneTextures,
+    readonly programs: Programs,
+  ) {
+    const { device, scene } = textures;
+    const finer = new Layout(scene, UPSAMPLING);
+    this.layout = Math.max(finer.width, finer.height) <= device.maxTextureSize ? finer : textures.layout;
+    const size = [this.layout.width, this.layout.height];
+    this.#device = device;
+    this.#upsampled = device.texture(device.drawsFloat32 ? 'rgba32f' : 'rgba16f', size, false);
+    this.#rows = device.texture('rgba32f', [rowWidth(scene, this.layout.upsampling), this.layout.lineCount], false);
+    this.#planes = device.texture('rgba16f', size, true);
+    this.#upsampleInto = device.framebuffer([this.#upsampled]);
+    this.#foldInto = device.framebuffer([this.#planes]);
+  }
+
+  /** Texels that folding at another time looks up and writes. */
+  get foldedTexels(): number {
+    const { blocks, layers } = this.layout;
+    return blocks.reduce((sum, block) => sum + block.width * layers[block.scale] * block.height, 0);
+  }
+
+  get memoryBytes(): number {
+    return [this.#upsampled, this.#rows, this.#planes].reduce((sum, texture) => sum + bytesOf(texture), 0);
+  }
+
+  planesChanged(): void {
+    this.#isUpsampled = false;
+    this.#folded = '';
+  }
+
+  /** Return the planes at a time in [0, 1]. */
+  at(time: number): Texture {
+    if (!this.#isUpsampled) {
+      this.#device.use(this.textures.planes, UNIT.planes);
+      this.#drawBlocks('upsample_plane.glsl', this.#upsampleInto);
+      this.#isUpsampled = true;
+    }
+    const { scene, layout } = this.textures;
+    const key = `${time} ${scene.version}`;
+    if (key !== this.#folded) {
+      this.#device.write(this.#rows, timeRows(scene, layout, time, this.layout.upsampling));
+      this.#device.use(this.#upsampled, UNIT.planes);
+      this.#device.use(this.#rows, UNIT.rows);
+      this.#drawBlocks('fold.glsl', this.#foldInto);
+      this.#folded = key;
+    }
+    return this.#planes;
+  }
+
+  /** Draw each plane by a shader that takes as uniforms where it lies and which rows go with it. */
+  #drawBlocks(name: string, into: Framebuffer): void {
+    const source = this.textures.layout;
+    const program = this.programs.get(name, source);
+    this.#device.set(program, {
+      upsampled: UNIT.planes,
+      upsampled_texel: [1 / into.width, 1 / into.height],
+      folded_rows_texel: this.#rows.size.map((side) => 1 / side),
+      largest: LARGEST_HALF,
+    });
+    for (const [i, block] of source.blocks.entries()) {
+      const written = this.layout.blocks[i];
+      this.#device.set(program, {
+        source: source.textureRectangle(block),
+        source_width: block.width / source.width,
+        origin: [written.x, written.y],
+        width: written.width,
+        per_texel: [1 / Math.max(written.width - 1, 1), 1 / Math.max(written.height - 1, 1)],
+        along_rows: isFoldedAlongRows(written.plane),
+        line: this.layout.firstLine(written),
+      });
+      const columns = this.layout.layers[written.scale] * written.width;
+      this.#device.draw(program, into.handle, [written.x, written.y, columns, written.height]);
+    }
+  }
+
+  release(): void {
+    for (const object of [this.#upsampleInto, this.#foldInto, this.#upsampled, this.#rows, this.#planes]) {
+      this.#device.release(object);
+    }
+  }
+}

@@ -1,0 +1,140 @@
+/** Pictures on the card, and how they come to their size and to the screen. */
+
+import { type Device, type Framebuffer, type Program, RenderError, type Texture } from './device.js';
+import { UNIT } from './scene_textures.js';
+import type { Defines } from './shader.js';
+
+/** Where a picture is shown: a part of a framebuffer, null being the canvas. */
+export interface Screen {
+  framebuffer: WebGLFramebuffer | null;
+  x: number;
+  y: number;
+  width: number;
+  height: number;
+}
+
+/** A picture, rows from below: colour and opacity; sum of weight times distance, number of samples and of look-ups. */
+export interface Target extends Framebuffer {
+  readonly rgba: Texture;
+  readonly sums: Texture;
+}
+
+/** What of pictures to show; the value is MODE of present.glsl. */
+export const SHOWN = { colour: 0, difference: 1 } as const;
+
+// Targets that are kept for the next use of their size.
+const TARGETS_KEPT = 6;
+
+export class Presentation {
+  readonly #programs = new Map<string, Program>();
+  readonly #targets = new Map<string, Target>();
+  #canvas: { shown: Texture; framebuffer: Framebuffer } | null = null;
+
+  constructor(readonly device: Device) {}
+
+  /** Return a target of a size; the last used are kept. */
+  target(name: string, width: number, height: number): Target {
+    const key = `${name} ${width} ${height}`;
+    const target = this.#targets.get(key) ?? this.#newTarget(width, height);
+    this.#targets.delete(key);
+    this.#targets.set(key, target);
+    if (this.#targets.size > TARGETS_KEPT) {
+      const [oldest] = this.#targets.keys();
+      this.#release(this.#targets.get(oldest) as Target);
+      this.#targets.delete(oldest);
+    }
+    return target;
+  }
+
+  /** Write the mean of `raysAcross` x `raysAcross` rays to each pixel of a target. */
+  average(marched: Target, target: Target, raysAcross: number): Target {
+    const program = this.#program('average.glsl');
+    this.device.set(program, { rgba_rays: UNIT.rgba, sums_rays: UNIT.sums, rays_across: raysAcross });
+    this.device.use(marched.rgba, UNIT.rgba);
+    this.device.use(marched.sums, UNIT.sums);
+    this.device.draw(program, target.handle, [0, 0, target.width, target.height]);
+    return target;
+  }
+
+  /**
+   * Show a picture, stretched to the size of a screen by a cubic.
+   * @param still the static part of the same picture, to be subtracted; null: nothing is.
+   * @param opacity of the picture over what the screen shows.
+   */
+  show(screen: Screen, picture: Target, still: Target | null, opacity: number): void {
+    const { device } = this;
+    const { x, y, width, height } = screen;
+    const viewport = [x, y, width, height] as const;
+    const isBlended = opacity < 1;
+    const isSameSize = picture.width === width && picture.height === height;
+    const canvas = isSameSize ? null : this.#canvasOf(picture.width, picture.height);
+    const present = this.#program('present.glsl', { MODE: still ? SHOWN.difference : SHOWN.colour });
+    device.set(present, {
+      rgba: UNIT.rgba,
+      sums: UNIT.sums,
+      static_rgba: UNIT.staticRgba,
+      viewport: [picture.width, picture.height],
+      origin: canvas ? [0, 0] : [x, y],
+      opacity: canvas ? 1 : opacity,
+    });
+    device.use(picture.rgba, UNIT.rgba);
+    device.use(picture.sums, UNIT.sums);
+    device.use((still ?? picture).rgba, UNIT.staticRgba);
+    if (canvas === null) {
+      device.draw(present, screen.framebuffer, viewport, { isBlended });
+      return;
+    }
+    device.draw(present, canvas.framebuffer.handle, [0, 0, picture.width, picture.height]);
+    const enlarge = this.#program('enlarge.glsl');
+    device.set(enlarge, { shown_small: UNIT.rgba, viewport: [width, height], origin: [x, y], opacity });
+    device.use(canvas.shown, UNIT.rgba);
+    device.draw(enlarge, screen.framebuffer, viewport, { isBlended });
+  }
+
+  release(): void {
+    for (const program of this.#programs.values()) this.device.release(program);
+    for (const target of this.#targets.values()) this.#release(target);
+    this.#programs.clear();
+    this.#targets.clear();
+    this.#releaseCanvas();
+  }
+
+  #program(name: string, defines: Defines = {}): Program {
+    const key = JSON.stringify([name, defines]);
+    const program = this.#programs.get(key) ?? this.device.program(name, { CONTRACTED: 0, NDC: 0, ...defines }, {});
+    this.#programs.set(key, program);
+    return program;
+  }
+
+  #newTarget(width: number, height: number): Target {
+    const { device } = this;
+    if (Math.max(width, height) > device.maxTextureSize) {
+      throw new RenderError(`a picture of ${width}x${height} is larger than ${device.name} takes`);
+    }
+    const isFloat32 = device.drawsFloat32;
+    const rgba = device.texture(isFloat32 ? 'rgba32f' : 'rgba16f', [width, height], false);
+    const sums = device.texture(isFloat32 ? 'rgba32f' : 'rgba16f', [width, height], false);
+    return { ...device.framebuffer([rgba, sums]), rgba, sums };
+  }
+
+  #release(target: Target): void {
+    for (const object of [target.rgba, target.sums]) this.device.release(object);
+    this.device.release({ handle: target.handle, width: target.width, height: target.height });
+  }
+
+  #canvasOf(width: number, height: number) {
+    if (this.#canvas?.framebuffer.width !== width || this.#canvas.framebuffer.height !== height) {
+      this.#releaseCanvas();
+      const shown = this.device.texture('rgba8', [width, height], false);
+      this.#canvas = { shown, framebuffer: this.device.framebuffer([shown]) };
+    }
+    return this.#canvas as { shown: Texture; framebuffer: Framebuffer };
+  }
+
+  #releaseCanvas(): void {
+    if (this.#canvas === null) return;
+    this.device.release(this.#canvas.framebuffer);
+    this.device.release(this.#canvas.shown);
+    this.#canvas = null;
+  }
+}
