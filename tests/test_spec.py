@@ -86,6 +86,15 @@ def test_readable_decoder_decodes_valid_vectors_to_the_manifest(name):
     assert_weights(scene, expected["decoder"])
     assert_motion_and_appearances(scene, expected)
     assert scene["metadata"] == expected.get("metadata", {})
+    assert_sound(scene["sound"], expected.get("sound"))
+
+
+def assert_sound(found: dict | None, expected: dict | None) -> None:
+    if found is not None:
+        packets = found["packets"]
+        lengths = np.array([len(packet) for packet in packets], "<u2").tobytes()
+        found = {**found, "packets": len(packets), "sha256": sha256(lengths + b"".join(packets))}
+    assert found == expected
 
 
 def assert_weights(scene: dict, expected: dict) -> None:

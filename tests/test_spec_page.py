@@ -11,9 +11,9 @@ import pytest
 from kpc.encoder.coding import rans
 from kpc.format.coding import poses
 from kpc.format.container import container as package_container
-from kpc.format.container import metadata_chunk, scene_layout
+from kpc.format.container import metadata_chunk, scene_layout, sound_chunk
 from kpc.format.core import decoding
-from kpc.format.scene import scene, space
+from kpc.format.scene import scene, sound, space
 
 SPEC = Path(__file__).parent.parent / "spec"
 sys.path.insert(0, str(SPEC))  # the readable decoder is no part of the package
@@ -119,7 +119,16 @@ def test_header_and_index_tables_are_those_of_the_readable_decoder():
 
 @pytest.mark.parametrize(
     "number, sizes",
-    {"6.1": [58, 10], "6.2": [12, 116], "6.3": [12], "6.4": [8], "6.5": [8, 10], "6.6": [68], "8.4": [17]}.items(),
+    {
+        "6.1": [58, 10],
+        "6.2": [12, 116],
+        "6.3": [12],
+        "6.4": [8],
+        "6.5": [8, 10],
+        "6.6": [68],
+        "6.9": [9],
+        "8.4": [17],
+    }.items(),
 )
 def test_sizes_in_the_text_are_those_of_the_tables(number, sizes):
     assert [table.size for table in byte_tables(section(number))] == sizes
@@ -136,6 +145,7 @@ def test_structures_are_those_of_the_package():
         "6.5": [scene_layout.DECODER_STRUCT, scene_layout.HYBRID_STRUCT],
         "6.6": [scene_layout.CAMERA_STRUCT],
         "6.7": [scene_layout.APPEARANCE_STRUCT],
+        "6.9": [sound_chunk.SOUND_STRUCT],
         "8.4": [poses.HEAD],
     }
     for number, structures in expected.items():
@@ -158,7 +168,7 @@ def test_limits_are_those_of_the_package():
     rows = re.findall(r"^\| ([A-Z_]+) \| (\d+) \|", section("11.1"), re.M)
     code = {
         name: int(value)
-        for module in (package_container, scene_layout, metadata_chunk)
+        for module in (package_container, scene_layout, metadata_chunk, sound_chunk)
         for name, value in vars(module).items()
         if name.endswith("_LIMIT") and name != "HEAD_LIMIT"
     }
@@ -179,6 +189,9 @@ def test_numbers_in_the_text_are_those_of_the_package():
     assert f"farther than {space.FAR:.0f} uniform_distance" in section("9.7")
     assert f"d_z <= {space.MIN_FORWARD:.4f}" in section("9.8")
     assert f"min(s / reach, {1 - space.MIN_DISPARITY})" in section("9.8")
+    assert f"{sound.SAMPLE_RATE} samples per second" in section("6.9")
+    assert f"pre_skip + n -\n{sound.PRE_ROLL}" in section("6.9")
+    assert f"1 .. {sound.PACKET_SAMPLES_LIMIT}" in section("6.9")
     models = "(32768, 0)", "/ (5 * model.count + 8)", "count + 1, 120"
     assert all(text in section("5.3") for text in models) and rans.ADAPTATION_LIMIT == 120
 

@@ -1,11 +1,12 @@
 """Writing a scene to a file: its chunks, in the order in which a player wants them.
 
 The coarsest picture of the first seconds comes first, then finer scales, then later seconds (spec/kpc-format.md,
-"Order of chunks").
+"Order of chunks"). Sound of a time lies behind the coarsest planes of that time.
 """
 
 import os
 import struct
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -39,9 +40,11 @@ from kpc.format.container.scene_layout import (
     parse_motion,
 )
 from kpc.format.container.segments import rows_per_segment, side_info_at
+from kpc.format.container.sound_chunk import pack_sound
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder
+from kpc.format.scene.sound import SAMPLE_RATE
 
 
 def write(scene: QuantisedScene, path: str | os.PathLike[str], *, segment_rows: int | None = None) -> int:
@@ -145,7 +148,9 @@ def _cameras_chunk(cameras: tuple[Camera, ...]) -> Chunk:
 
 
 def _plane_chunks(scene: QuantisedScene, segment_rows: int | None) -> list[Chunk]:
-    """Return the PLNE chunks: first segments of all scales, coarse to fine, then later segments."""
+    """Return the PLNE and soun chunks: first segments of all scales, coarse to fine, then later segments; each soun
+    chunk behind those of the coarsest scale that begin before it.
+    """
     segments = [
         (start / len(plane.symbols), number, ALL_PLANES.index(name), start, stop)
         for number, scale in enumerate(scene.scales)
@@ -156,8 +161,13 @@ def _plane_chunks(scene: QuantisedScene, segment_rows: int | None) -> list[Chunk
         {name: needed_texels(scene.occupancy, name, *plane.coded.shape) for name, plane in scale.items()}
         for scale in scene.scales
     ]
+    sound = [] if scene.sound is None else pack_sound(scene.sound)
+    sound_begins = [_begin_of_sound(chunk, scene, segments) for chunk in sound]
     chunks = []
-    for _, number, plane_number, start, stop in sorted(segments):
+    for begin, number, plane_number, start, stop in sorted(segments):
+        while sound and (begin, number) > (sound_begins[0], 0):
+            chunks.append(sound.pop(0))
+            del sound_begins[0]
         name = ALL_PLANES[plane_number]
         plane = scene.scales[number][name]
         symbols, coded = plane.symbols[start:stop], plane.coded[start:stop]
@@ -165,7 +175,15 @@ def _plane_chunks(scene: QuantisedScene, segment_rows: int | None) -> list[Chunk
         codec, make = choose_codec(symbols, coded, side_info, implied[number][name][start:stop])
         position = number, plane_number, start, stop - start
         chunks.append(Chunk("PLNE", encode_raw_segment(symbols, coded), *position, codec, make, symbols.size))
-    return chunks
+    return chunks + sound
+
+
+def _begin_of_sound(chunk: Chunk, scene: QuantisedScene, segments: Sequence[tuple[float, int, int, int, int]]) -> float:
+    """Return when the latest segments begin that do not begin after a soun chunk, as a share of the clip."""
+    assert scene.sound is not None
+    heard_s = (chunk.row_start - scene.sound.pre_skip) / SAMPLE_RATE
+    share = heard_s / max(scene.clip.duration_s, 1 / SAMPLE_RATE)
+    return max((begin for begin, *_ in segments if begin <= share), default=0.0)
 
 
 def _segment_bounds(plane: QuantisedPlane, over_time: bool, segment_rows: int | None) -> list[tuple[int, int]]:

@@ -21,6 +21,7 @@ from kpc.format.scene.cameras import Camera
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.motion import QuantisedMotion, quantise_motion, reached_cells
 from kpc.format.scene.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
+from kpc.format.scene.sound import Sound
 from kpc.format.scene.space import SpaceMapping
 
 SYMBOL_MIN, SYMBOL_MAX = -128, 127
@@ -163,6 +164,7 @@ class QuantisedScene:
     motion: QuantisedMotion | None = None
     appearances: tuple[Appearance, ...] = field(default=())
     metadata: Metadata = field(default_factory=Metadata)
+    sound: Sound | None = None
 
     def dequantise(self) -> Scene:
         """Return the scene that every decoder sees."""
@@ -180,6 +182,7 @@ class QuantisedScene:
             None if self.motion is None else self.motion.dequantise(),
             self.appearances,
             self.metadata,
+            self.sound,
         )
 
     @property
@@ -248,6 +251,7 @@ def quantise_scene(
         None if scene.motion is None else quantise_motion(scene.motion),
         tuple(Appearance(appearance.name, to_half(appearance.code, "appearances")) for appearance in scene.appearances),
         scene.metadata,
+        scene.sound,
     )
 
 

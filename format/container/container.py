@@ -140,8 +140,8 @@ class StoredChunk:
 def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) -> bytes:
     """Return a file of these chunks in their order, each under the codec with which it is smallest.
 
-    Zstandard is tried for plane segments only where their own codec cannot be used: it would double the time and
-    never be smaller.
+    Zstandard is tried for plane segments only where their own codec cannot be used, and never for sound: it would
+    double the time and never be smaller.
 
     Args:
         value_count: numbers in all planes together.
@@ -188,7 +188,7 @@ def _encodings(chunk: Chunk, compress: bool) -> list[tuple[bytes, Codec, int]]:
         body, raw_length = chunk.encode(), len(chunk.raw) if chunk.raw_length is None else chunk.raw_length
         if raw_length <= len(body) * EXPANSION_LIMIT:
             found.append((body, chunk.codec, raw_length))
-    if compress and (chunk.kind != "PLNE" or len(found) == 1):
+    if compress and chunk.kind != "soun" and (chunk.kind != "PLNE" or len(found) == 1):
         found += [(frame, Codec.ZSTD, len(chunk.raw)) for frame in _zstd_frames(chunk.raw)]
     return found
 

@@ -89,7 +89,9 @@ class PartialScene:
         self.until = np.where(self.moves, (first + count) / last, 2.0) + TIME_TOLERANCE
         self.sizes = count * np.array([plane.columns * plane.channels for plane in map(self.head_of, self.numbers)])
         first_picture = {
-            number for number, entry in enumerate(reader.index) if entry.kind in KNOWN_KINDS and entry.kind != "PLNE"
+            number
+            for number, entry in enumerate(reader.index)
+            if entry.kind in KNOWN_KINDS and entry.kind not in ("PLNE", "soun")
         }
         announce(reader, adjacent_runs(reader.index, sorted(first_picture.union(self.needed(1, 0.0, 0.0))))[0])
         motion = reader.motion()

@@ -4,6 +4,7 @@ after it).
     SCNE  box, clip, sizes, quantisation steps and offsets of every plane     WARP  mapping of space beyond the box
     MOVE  motion grid            DECO, HYBR  weights of a decoder             OCCU  occupancy grid
     came  cameras                appe        appearances                  meta  metadata (`metadata_chunk`)
+    soun  sound (`sound_chunk`)
 
 `pack_...` makes the content, `parse_...` reads and checks it. Every parser raises a FormatError if the content is too
 short, too long or breaks a rule of the format.
@@ -54,7 +55,7 @@ FRAME_TOLERANCE = 1e-4  # of the products of the axes of a frame, which should b
 BOX_LIMIT = 1 << 30
 
 GROUP_KIND = "GRUP"  # a scene's file in a file of several, `kpc.format.container.groups`
-KNOWN_KINDS = frozenset({"SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "meta", "PLNE"})
+KNOWN_KINDS = frozenset({"SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "meta", "soun", "PLNE"})
 HEAD_LIMIT = SCENE_STRUCT.size + SCALE_LIMIT * (SCALE_STRUCT.size + 9 * 4 * CHANNEL_LIMIT)  # bytes of SCNE, at most
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, partial
+from itertools import takewhile
 from typing import TypeVar
 
 import numpy as np
@@ -50,6 +51,7 @@ from kpc.format.container.segments import (
     needs_occupancy,
     side_info_of,
 )
+from kpc.format.container.sound_chunk import SOUND_LIMIT, SoundSegment, parse_sound, sound_chunks, sound_of
 from kpc.format.container.sources import AnySource, open_source
 from kpc.format.core.decoding import decode_segment, implied_rows
 from kpc.format.scene.cameras import Camera
@@ -64,6 +66,7 @@ from kpc.format.scene.scene import (
     Decoder,
     HybridDecoder,
 )
+from kpc.format.scene.sound import Sound
 from kpc.format.scene.space import SpaceMapping
 
 Parsed = TypeVar("Parsed")
@@ -103,6 +106,7 @@ def read(
         reader.motion(),
         reader.appearances(),
         reader.metadata(),
+        reader.sound(),
     )
 
 
@@ -156,6 +160,7 @@ class SceneReader(Reader):
 
     Attributes:
         head: the SCNE chunk.
+        sound_numbers: of the soun chunks, in the order of time.
 
     Raises:
         FormatError, BudgetError: as `read`.
@@ -187,6 +192,7 @@ class SceneReader(Reader):
                 f"{self.name}: needs {self.planes_bytes:,} bytes of memory, more than the budget of {memory_budget:,}"
             )
         self._check_segments()
+        self.sound_numbers = self._parsed(lambda _: sound_chunks(self.index), b"")
         self._decoder_number()
         self._only("OCCU")
 
@@ -311,6 +317,24 @@ class SceneReader(Reader):
             return Metadata()
         return self._parsed(parse_metadata, self.chunk(number, META_LIMIT))
 
+    def sound(self) -> Sound | None:
+        """Return the sound, of whose packets those are there that come before the first that is missing; None if the
+        file has (or has yet) none.
+        """
+        held = list(takewhile(self.available, self.sound_numbers))
+        self._afford(3 * sum(self.index[number].stored_length for number in held), "its sound")
+        return self._parsed(lambda _: sound_of(map(self.sound_segment, held)), b"")
+
+    def sound_segment(self, number: int) -> SoundSegment:
+        """Return the content of a soun chunk."""
+        content, samples = self.chunk(number, SOUND_LIMIT), self.index[number].row_count
+        return self._parsed(lambda raw: parse_sound(raw, samples, self.sound_samples), content)
+
+    @property
+    def sound_samples(self) -> int:
+        """The samples that all soun chunks decode to."""
+        return sum(self.index[number].row_count for number in self.sound_numbers)
+
     def _only(self, kind: str) -> int:
         """Return the number of the one chunk of a kind."""
         found = [number for number, entry in enumerate(self.index) if entry.kind == kind]
@@ -367,7 +391,7 @@ class SceneReader(Reader):
         for number, entry in enumerate(self.index):
             if entry.kind != "PLNE":
                 position = entry.group, entry.scale, entry.plane, entry.row_start, entry.row_count
-                if entry.kind in KNOWN_KINDS and any(position):
+                if entry.kind in KNOWN_KINDS and entry.kind != "soun" and any(position):
                     raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) claims a position among the planes")
                 continue
             if entry.group != 0 or (entry.scale, entry.plane) not in found:

@@ -28,6 +28,7 @@ import numpy as np
 from kpc.format.common.errors import UsageError
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.metadata import Metadata
+from kpc.format.scene.sound import Sound
 from kpc.format.scene.space import DeviceCoordinates, SpaceMapping
 
 SPACE_PLANES = ("xy", "xz", "yz")
@@ -204,6 +205,7 @@ class Scene:
     motion: np.ndarray | None = None
     appearances: tuple[Appearance, ...] = field(default=())
     metadata: Metadata = field(default_factory=Metadata)
+    sound: Sound | None = None
 
     def at(self, time: float) -> "tuple[Scene, float]":
         """Return the scene shown at `time` and the time in it: itself and `time`.

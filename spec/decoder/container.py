@@ -19,6 +19,7 @@ CODECS = {  # beside RAW and ZSTD
     b"WARP": (),
     b"appe": (),
     b"meta": (),
+    b"soun": (),
 }
 HEADER, ENTRY = struct.Struct("<8sHHIIIQQII"), struct.Struct("<4sHBBIIHIII")
 EXPANSION_LIMIT = 32768
@@ -112,7 +113,8 @@ def scene_contents(data, is_prefix):  # sections 4.3 and 4.4
         if chunk.kind not in CODECS:
             continue
         position = chunk.scale, chunk.plane, chunk.row_start, chunk.row_count
-        require(chunk.group == 0 and (chunk.kind == b"PLNE" or not any(position)), "invalid fields of an index entry")
+        has_position = chunk.kind in (b"PLNE", b"soun")
+        require(chunk.group == 0 and (has_position or not any(position)), "invalid fields of an index entry")
         require(chunk.codec in (RAW, ZSTD, *CODECS[chunk.kind]), "unknown codec")
         require(chunk.codec != RAW or chunk.raw_length == chunk.stored_length, "invalid raw length")
         require(chunk.codec <= ZSTD or chunk.raw_length <= EXPANSION_LIMIT * chunk.stored_length, "invalid raw length")

@@ -16,6 +16,7 @@ from .payloads import (
 )
 from .planes import decode_segment, dequantise
 from .scene_chunks import decode_scne, decode_warp
+from .sound import decode_sound
 
 SINGLE_KINDS = "SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "meta"
 
@@ -23,11 +24,13 @@ SINGLE_KINDS = "SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "
 def decode(data, is_prefix=False):
     """Return the scene as a dict of numbers, lists and dicts."""
     chunks, value_count = scene_contents(data, is_prefix)
-    single, segments = {}, []
+    single, segments, sound = {}, [], []
     for chunk, content in chunks:
         kind = chunk.kind.decode()
         if kind == "PLNE":
             segments.append((chunk.scale, chunk.plane, chunk.row_start, chunk.row_count, content))
+        elif kind == "soun":
+            sound.append((chunk, content))
         else:
             require(kind not in single, f"there are two {kind} chunks")
             single[kind] = content
@@ -58,6 +61,7 @@ def decode(data, is_prefix=False):
         scene["appearances"] = decode_appearances(ByteReader(single["appe"].data), scene["hidden"])
     if single.get("meta") is not None:
         scene["metadata"] = decode_metadata(single["meta"].data)
+    scene["sound"] = decode_sound(sound)
     decode_planes(scene, segments)
     return scene
 

@@ -44,6 +44,17 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
         found["motion"] = {"shape": list(scene.motion.symbols.shape), "sha256": _sha256(values)}
     if scene.metadata:
         found["metadata"] = scene.metadata.document
+    if scene.sound is not None:
+        sound = scene.sound
+        packets = [np.frombuffer(packet, np.uint8) for packet in sound.packets]
+        lengths = np.array([len(packet) for packet in sound.packets], "<u2")
+        found["sound"] = {
+            "channels": sound.channels,
+            "pre_skip": sound.pre_skip,
+            "sample_count": sound.sample_count,
+            "packets": len(packets),
+            "sha256": _sha256(lengths, *packets),
+        }
     if scene.appearances:
         names = [np.frombuffer(one.name.encode(), np.uint8) for one in scene.appearances]
         codes = [one.code.astype("<f4") for one in scene.appearances]

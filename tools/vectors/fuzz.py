@@ -74,7 +74,7 @@ WHOLES = (
     1 << 50,
 )
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-30, 1e30, 3e38, float("nan"), float("inf"), -float("inf"), 5e-324, 1e300)
-KINDS = ("SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "meta", "PLNE", "GRUP", "note", "Note")
+KINDS = ("SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "meta", "soun", "PLNE", "GRUP", "note", "Note")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
-from kpc.tools.vectors import group_vectors, metadata_vectors
+from kpc.tools.vectors import group_vectors, metadata_vectors, sound_vectors
 from kpc.tools.vectors.description import ZSTD_VERSION, described, manifest_json
 from kpc.tools.vectors.invalid import invalid
 from kpc.tools.vectors.valid import valid
@@ -43,22 +43,22 @@ def vectors() -> dict[str, bytes]:
 
 def files() -> dict[str, bytes]:
     """Return the .kpc files: path -> content."""
-    scenes = valid() | metadata_vectors.valid()
+    scenes = valid() | metadata_vectors.valid() | sound_vectors.valid()
     whole = {name: data for name, (data, partial) in scenes.items() if not partial}
     found = {f"valid/{name}.kpc": data for name, (data, _) in (scenes | group_vectors.valid(whole)).items()}
-    refused = invalid() | metadata_vectors.invalid() | group_vectors.invalid(whole)
+    refused = invalid() | metadata_vectors.invalid() | sound_vectors.invalid() | group_vectors.invalid(whole)
     return found | {f"invalid/{name}.kpc": data for name, (data, *_) in refused.items()}
 
 
 def manifest() -> dict[str, dict[str, Any]]:
     """Return what `manifest.json` says of every vector."""
-    scenes = valid() | metadata_vectors.valid()
+    scenes = valid() | metadata_vectors.valid() | sound_vectors.valid()
     whole = {name: data for name, (data, partial) in scenes.items() if not partial}
     names = {data: name for name, data in whole.items()}
     found = {name: _hash(data) | described(data, partial) for name, (data, partial) in scenes.items()}
     for name, (data, partial) in group_vectors.valid(whole).items():
         found[name] = _hash(data) | group_vectors.described(data, partial, names)
-    refused = invalid() | metadata_vectors.invalid() | group_vectors.invalid(whole)
+    refused = invalid() | metadata_vectors.invalid() | sound_vectors.invalid() | group_vectors.invalid(whole)
     return {
         "valid": found,
         "invalid": {name: {"error": error, "message": message} for name, (_, error, message) in refused.items()},

@@ -18,6 +18,7 @@ export type {
   Scale,
   SceneHead,
 } from './container/scene_chunks.js';
+export { PRE_ROLL, packetSamples, SAMPLE_RATE, type Sound, type SoundSegment } from './container/sound.js';
 export { type Part, type Span, Timeline } from './container/timeline.js';
 export { Core, type SegmentSymbols } from './decoder/core.js';
 export { loadCore } from './decoder/module.js';

@@ -70,6 +70,13 @@ function described(scene: Scene): Json {
     found.appearances = { count: appearances.length, ...sums };
   }
   if (Object.keys(metadata).length) found.metadata = metadata;
+  const { sound } = scene;
+  if (sound) {
+    const lengths = Uint16Array.from(sound.packets, (packet) => packet.length);
+    const { channels, preSkip, sampleCount, packets } = sound;
+    const head = { channels, pre_skip: preSkip, sample_count: sampleCount, packets: packets.length };
+    found.sound = { ...head, sha256: sha256(lengths, ...packets) };
+  }
   return found;
 }
 

@@ -32,8 +32,9 @@ import {
   type Scale,
   type SceneHead,
 } from './scene_chunks.js';
+import { parseSound, SOUND_LIMIT, type Sound, type SoundSegment, soundChunks, soundOf } from './sound.js';
 
-const KNOWN_KINDS = ['SCNE', 'WARP', 'MOVE', 'DECO', 'HYBR', 'OCCU', 'came', 'appe', 'meta', 'PLNE'];
+const KNOWN_KINDS = ['SCNE', 'WARP', 'MOVE', 'DECO', 'HYBR', 'OCCU', 'came', 'appe', 'meta', 'soun', 'PLNE'];
 const HEAD_LIMIT = 58 + LIMIT.SCALE * (10 + 9 * 4 * LIMIT.CHANNEL);
 const AXIS_OF: Record<string, number> = { t: 0, z: 1, y: 2, x: 3 };
 
@@ -56,6 +57,8 @@ export class Scene {
   readonly head: SceneHead;
   readonly core: Core;
   readonly memoryBudget: number;
+  /** The numbers of the soun chunks, in the order of time. */
+  readonly soundNumbers: readonly number[];
   readonly #decoded = new Map<string, unknown>();
   readonly #counted = new Map<string, number>();
 
@@ -71,6 +74,7 @@ export class Scene {
     this.memoryBudget = options.memoryBudget ?? 2 ** 31;
     this.#afford(options.inParts ? 0 : 5 * this.head.valueCount, 'its planes');
     this.#checkSegments();
+    this.soundNumbers = soundChunks(this.container.index);
     this.#decoderNumber();
     this.#only('OCCU');
   }
@@ -144,6 +148,22 @@ export class Scene {
   /** The metadata; an empty object if the file has, or has yet, no such chunk. */
   get metadata(): Metadata {
     return this.#once('meta', (number) => parseMetadata(this.container.chunk(number).content(META_LIMIT))) ?? {};
+  }
+
+  /** The sound up to the first chunk that is not there; null if the file has, or has yet, none. */
+  get sound(): Sound | null {
+    const missing = this.soundNumbers.findIndex((number) => !this.container.available(number));
+    const held = missing < 0 ? this.soundNumbers : this.soundNumbers.slice(0, missing);
+    const bytes = held.reduce((sum, number) => sum + this.container.index[number].storedLength, 0);
+    this.#afford(3 * bytes, 'its sound');
+    return soundOf(held.map((number) => this.soundSegment(number)));
+  }
+
+  /** Read a soun chunk. */
+  soundSegment(number: number): SoundSegment {
+    const { index } = this.container;
+    const total = this.soundNumbers.reduce((sum, one) => sum + index[one].rowCount, 0);
+    return parseSound(this.container.chunk(number).content(SOUND_LIMIT), index[number].rowCount, total);
   }
 
   /** Return what SCNE says of the plane that a PLNE chunk is a segment of, and the name of the plane. */
@@ -272,7 +292,11 @@ export class Scene {
           );
         }
         segments.push(entry);
-      } else if (KNOWN_KINDS.includes(entry.kind) && (group || scale || plane || rowStart || rowCount)) {
+      } else if (
+        entry.kind !== 'soun' &&
+        KNOWN_KINDS.includes(entry.kind) &&
+        (group || scale || plane || rowStart || rowCount)
+      ) {
         throw new FormatError(`${this.container.chunk(number).label} claims a position among the planes`);
       }
     }
