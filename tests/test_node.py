@@ -1,12 +1,22 @@
 """The browser player (player/web): its own tests, and the built files that are part of the Python package."""
 
 import gzip
+import json
+import os
 import re
 import shutil
 import subprocess
+from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from kpc.format.container.partial import PartialScene
+from kpc.format.container.scene_io import SceneReader
+from kpc.player.streaming.prefetch import Playhead, fetch_order, min_segment_bytes, segments_to_keep
+from partial_scenes import coded
+from scenes import tiny_scene
 
 WEB = Path(__file__).parent.parent / "player" / "web"
 BUILT = ("kpc-player.js", "kpc-worker.js")
@@ -26,8 +36,8 @@ def node() -> str:
     return program
 
 
-def run(*command: str | Path) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, cwd=WEB)
+def run(*command: str | Path, **environment: str) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, cwd=WEB, env=os.environ | environment)
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
 
 
@@ -38,6 +48,21 @@ def test_types_and_style_are_in_order(node: str) -> None:
 
 def test_the_tests_of_node_pass(node: str) -> None:
     run(node, "build.mjs", "--test")
+
+
+def test_segments_are_fetched_in_the_order_of_the_desktop_player(node: str, tmp_path: Path) -> None:
+    file = coded(tiny_scene(4, time=20), 2)
+    scene, numbers = PartialScene(SceneReader(file, in_parts=True)), np.random.default_rng(3)
+    cases = []
+    for shown in (0, 0, 1, 2) * 10:
+        head = Playhead(float(numbers.random()), float(numbers.choice([0, 0.05, 0.5])), bool(numbers.integers(2)))
+        available = int(numbers.integers(scene.sizes.sum()))
+        order, keep = fetch_order(scene, head, shown).tolist(), segments_to_keep(scene, head, available).tolist()
+        cases.append({"head": asdict(head), "shown": shown, "available": available, "order": order, "keep": keep})
+    (tmp_path / "scene.kpc").write_bytes(file)
+    described = {"file": str(tmp_path / "scene.kpc"), "least": min_segment_bytes(scene), "cases": cases}
+    (tmp_path / "cases.json").write_text(json.dumps(described))
+    run(node, "build.mjs", "--test", "prefetch", KPC_PREFETCH_CASES=str(tmp_path / "cases.json"))
 
 
 def test_the_built_files_are_those_of_the_sources(node: str, tmp_path: Path) -> None:

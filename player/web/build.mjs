@@ -63,8 +63,7 @@ async function build(outdir) {
 async function test(names) {
   const files = readdirSync(join(FOLDER, 'tests')).filter((name) => name.endsWith('.test.ts'));
   const chosen = files.filter((name) => names.length === 0 || names.includes(basename(name, '.test.ts')));
-  const outdir = join(FOLDER, 'build', 'tests');
-  rmSync(outdir, { recursive: true, force: true });
+  const outdir = join(FOLDER, 'build', `tests-${process.pid}`);
   await esbuild.build({
     ...OPTIONS,
     entryPoints: chosen.map((name) => `tests/${name}`),
@@ -76,8 +75,12 @@ async function test(names) {
     sourcemap: 'inline',
   });
   const built = chosen.map((name) => join(outdir, name.replace(/ts$/, 'mjs')));
-  return spawnSync(process.execPath, ['--enable-source-maps', '--test', ...built], { cwd: FOLDER, stdio: 'inherit' })
-    .status;
+  const run = spawnSync(process.execPath, ['--enable-source-maps', '--test', ...built], {
+    cwd: FOLDER,
+    stdio: 'inherit',
+  });
+  rmSync(outdir, { recursive: true, force: true });
+  return run.status;
 }
 
 /** Bundle a script of a page. */

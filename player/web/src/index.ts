@@ -27,3 +27,5 @@ export { RenderError } from './render/device.js';
 export type { DrawnScene } from './render/drawn_scene.js';
 export { LEVEL_NAMES, type Level } from './render/quality.js';
 export { type DrawnPicture, type DrawOptions, type Moment, Renderer, type ShownPart } from './render/renderer.js';
+export { Clip, type ClipOptions, type ClipPosition, SceneEvent, type ScenePart } from './streaming/clip.js';
+export type { SceneStream, TexelRows } from './streaming/scene_stream.js';

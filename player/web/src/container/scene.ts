@@ -34,9 +34,10 @@ import {
 } from './scene_chunks.js';
 import { parseSound, SOUND_LIMIT, type Sound, type SoundSegment, soundChunks, soundOf } from './sound.js';
 
-const KNOWN_KINDS = ['SCNE', 'WARP', 'MOVE', 'DECO', 'HYBR', 'OCCU', 'came', 'appe', 'meta', 'soun', 'PLNE'];
+export const KNOWN_KINDS = ['SCNE', 'WARP', 'MOVE', 'DECO', 'HYBR', 'OCCU', 'came', 'appe', 'meta', 'soun', 'PLNE'];
 const HEAD_LIMIT = 58 + LIMIT.SCALE * (10 + 9 * 4 * LIMIT.CHANNEL);
-const AXIS_OF: Record<string, number> = { t: 0, z: 1, y: 2, x: 3 };
+/** The position of an axis, by its letter, in the sizes of OCCU. */
+export const axisOf = (letter: string): number => 'tzyx'.indexOf(letter);
 
 export interface SceneOptions extends ContainerOptions {
   /** Bytes that the scene may take. */
@@ -182,7 +183,7 @@ export class Scene {
   /** Return the occupancy grid projected onto a plane. */
   projection(name: PlaneName): Projection {
     const { sizes, content } = this.occupancy;
-    const cells: [number, number] = [sizes[AXIS_OF[name[1]]], sizes[AXIS_OF[name[0]]]];
+    const cells: [number, number] = [sizes[axisOf(name[1])], sizes[axisOf(name[0])]];
     if (!this.#decoded.has(name)) {
       this.#afford(cells[0] * cells[1], `the projection of its occupancy onto ${name}`);
       this.#decoded.set(name, this.core.project(content, PLANES.indexOf(name), cells[0] * cells[1]));

@@ -70,6 +70,17 @@ export class DecoderPool {
     this.#fallback = spawn || workerUrl ? null : spawnSibling;
   }
 
+  /** Bytes that all tasks that run at once may take. */
+  get memory(): number {
+    return this.#memory;
+  }
+
+  /** Start a worker for a task that will come. */
+  warm(): void {
+    const [slot] = this.#slots;
+    if (slot.port === null && !this.#isClosed) this.#start(slot);
+  }
+
   /** Tasks that wait or run. */
   get pending(): number {
     return this.#queue.length + this.#slots.filter((slot) => slot.job).length;
@@ -127,20 +138,21 @@ export class DecoderPool {
       this.#queue.shift();
       slot.job = job;
       if (slot.isReady) this.#send(slot, job);
-      else this.#start(slot);
+      else if (slot.port === null) this.#start(slot);
+      else this.#arm(slot, job);
     }
   }
 
   async #start(slot: Slot): Promise<void> {
     try {
       const module = await coreModule();
-      if (this.#isClosed || slot.job === null) return;
+      if (this.#isClosed || slot.port !== null) return;
       const port = this.#spawn({
         message: (data) => this.#receive(slot, port, data as Answer),
         failed: (reason) => this.#lost(slot, port, reason),
       });
       slot.port = port;
-      this.#arm(slot, slot.job);
+      if (slot.job) this.#arm(slot, slot.job);
       port.post({ module, memoryLimit: this.#memory }, []);
     } catch (error) {
       this.#lost(slot, slot.port, String(error));
@@ -200,7 +212,7 @@ export class DecoderPool {
     if (!hasStarted && this.#fallback && !this.#isClosed) {
       this.#spawn = this.#fallback;
       for (const other of this.#slots) {
-        if (other.job && !other.isReady) {
+        if (!other.isReady && (other.job || other === slot)) {
           this.#end(other);
           this.#start(other);
         }

@@ -1,0 +1,73 @@
+/** Opening a scene: header and index, and all chunks but planes. */
+
+import type { Entry } from '../container/chunk.js';
+import { Container, HEADER_LENGTH, readHeader } from '../container/container.js';
+import { BudgetError, FormatError } from '../container/errors.js';
+import { KNOWN_KINDS } from '../container/scene.js';
+import type { DecoderPool } from '../decoder/pool.js';
+import type { SceneContent } from '../decoder/tasks.js';
+import { FIRST_BYTES } from './http.js';
+import type { Source } from './source.js';
+
+/** Read header and index of a file; return them with the first bytes of the file, which may hold chunks, too. */
+export async function openContainer(source: Source, signal?: AbortSignal): Promise<Container> {
+  let bytes = await source.read(0, FIRST_BYTES, { signal });
+  const { indexLength, fileLength } = readHeader(bytes, true);
+  if (source.size !== null && source.size > fileLength) {
+    throw new FormatError(`${source.size - fileLength} bytes follow the end of the file`);
+  }
+  const needed = HEADER_LENGTH + indexLength;
+  if (bytes.length < needed) bytes = await source.read(0, needed, { signal });
+  return new Container(bytes, { allowPartial: true });
+}
+
+/** Split chunks, in the order given, into runs that lie side by side in the file and take at most so many bytes. */
+export function adjacentRuns(index: readonly Entry[], numbers: readonly number[], mostBytes = Infinity): number[][] {
+  const found: number[][] = [];
+  let [end, size] = [-1, 0];
+  for (const number of numbers) {
+    const { offset, storedLength } = index[number];
+    const run = found[found.length - 1];
+    if (run !== undefined && offset === end && size + storedLength <= mostBytes) run.push(number);
+    else {
+      found.push([number]);
+      size = 0;
+    }
+    end = offset + storedLength;
+    size += storedLength;
+  }
+  return found;
+}
+
+/** Whether a chunk is there, as far as is known. */
+export const isThere = (entry: Entry, source: Source): boolean =>
+  source.size === null || entry.offset + entry.storedLength <= source.size;
+
+/** Read everything that is in a scene but planes and sound. */
+export async function readContent(
+  source: Source,
+  { index, bytes }: Container,
+  pool: DecoderPool,
+  memory: number,
+  signal?: AbortSignal,
+): Promise<SceneContent> {
+  const numbers = [...index.keys()].filter((number) => {
+    const { kind } = index[number];
+    const isStreamed = kind === 'PLNE' || kind === 'soun';
+    return !isStreamed && KNOWN_KINDS.includes(kind) && isThere(index[number], source);
+  });
+  const bodies = new Map<number, Uint8Array>();
+  for (const run of adjacentRuns(index, numbers)) {
+    const [first, last] = [index[run[0]], index[run[run.length - 1]]];
+    const end = last.offset + last.storedLength;
+    if (end - first.offset > memory) throw new BudgetError(`${source.name}: takes more memory than the budget`);
+    const read = await source.read(first.offset, end, { signal });
+    for (const number of run) {
+      const { offset, storedLength } = index[number];
+      const body = read.slice(offset - first.offset, offset - first.offset + storedLength);
+      if (body.length === storedLength) bodies.set(number, body);
+    }
+  }
+  const start = bytes.slice(0, index[0].offset);
+  return pool.run({ kind: 'scene', start, bodies, memoryBudget: memory }, { signal });
+}

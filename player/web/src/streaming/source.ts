@@ -1,0 +1,77 @@
+/** Where a file's bytes come from. */
+
+export interface ReadOptions {
+  /** Ends the read, which then throws a KpcError `aborted`. */
+  signal?: AbortSignal;
+  /** Called as bytes come, with all that are there from the start of the read on. */
+  arrived?: (bytes: Uint8Array) => void;
+  /** Whether to ask the server although a cache holds the bytes, which came damaged. */
+  fresh?: boolean;
+}
+
+export interface Source {
+  /** For messages: no secrets. */
+  readonly name: string;
+  /** Bytes; null as long as nobody says. */
+  readonly size: number | null;
+  /** Bytes that have been received so far. */
+  readonly receivedBytes: number;
+  /** Bytes of memory that the source takes. */
+  readonly memoryBytes: number;
+  /** Return the bytes from `start` to before `end`, fewer only at the end of the file. */
+  read(start: number, end: number, options?: ReadOptions): Promise<Uint8Array>;
+  close(): void;
+}
+
+/** A file that the page has: chosen by its user, or dropped. */
+export class BlobSource implements Source {
+  readonly name: string;
+  readonly size: number;
+  receivedBytes = 0;
+  readonly memoryBytes = 0;
+  readonly #blob: Blob;
+
+  constructor(blob: Blob) {
+    this.#blob = blob;
+    this.size = blob.size;
+    this.name = 'name' in blob ? String(blob.name) : 'the file';
+  }
+
+  async read(start: number, end: number, { arrived }: ReadOptions = {}): Promise<Uint8Array> {
+    const bytes = new Uint8Array(await this.#blob.slice(start, end).arrayBuffer());
+    this.receivedBytes += bytes.length;
+    arrived?.(bytes);
+    return bytes;
+  }
+
+  close(): void {}
+}
+
+/** A file within a file: a group of a clip. */
+export class SlicedSource implements Source {
+  readonly name: string;
+  readonly size: number;
+  readonly #whole: Source;
+  readonly #offset: number;
+
+  constructor(whole: Source, offset: number, length: number, name: string) {
+    this.name = name;
+    this.#whole = whole;
+    this.#offset = offset;
+    this.size = whole.size === null ? length : Math.max(0, Math.min(length, whole.size - offset));
+  }
+
+  get receivedBytes(): number {
+    return this.#whole.receivedBytes;
+  }
+
+  get memoryBytes(): number {
+    return this.#whole.memoryBytes;
+  }
+
+  read(start: number, end: number, options?: ReadOptions): Promise<Uint8Array> {
+    return this.#whole.read(this.#offset + start, this.#offset + Math.min(end, this.size), options);
+  }
+
+  close(): void {}
+}

@@ -1,0 +1,383 @@
+/** Clips while they arrive: from servers with faults, in little memory, and after jumps of the playhead. */
+
+import assert from 'node:assert/strict';
+import test from 'node:test';
+
+import { Container } from '../src/container/container.js';
+import { type ErrorCode, KpcError } from '../src/container/errors.js';
+import { Scene } from '../src/container/scene.js';
+import { isTimePlane, PLANES, type PlaneHead } from '../src/container/scene_chunks.js';
+import { loadCore } from '../src/decoder/module.js';
+import { layerTexels } from '../src/decoder/texels.js';
+import { Clip, type ClipOptions, type SceneEvent } from '../src/streaming/clip.js';
+import type { SceneStream, TexelRows } from '../src/streaming/scene_stream.js';
+import { read } from './files.js';
+import { spawnNode } from './node_worker.js';
+import { withServer } from './server.js';
+import { grouped, scene } from './writing.js';
+
+const SAMPLE = read('samples/default.kpc');
+/** 100 s in 16 segments of each time plane; the first request holds no more than scale 0. */
+const SIZES = { frameCount: 1001, segmentRows: 32 };
+const LONG = scene({
+  ...SIZES,
+  scales: [
+    [4, 32, 32, 32, 512],
+    [8, 64, 64, 64, 512],
+  ],
+});
+const SHORT = {
+  scales: [
+    [4, 24, 24, 24, 32],
+    [8, 48, 48, 48, 32],
+  ] as [number, number, number, number, number][],
+};
+const core = await loadCore();
+
+const hasCode =
+  (code: ErrorCode, words = '') =>
+  (error: unknown) =>
+    error instanceof KpcError && error.code === code && error.message.includes(words);
+
+async function withClip(
+  src: string | ArrayBuffer,
+  options: ClipOptions,
+  body: (clip: Clip) => Promise<void>,
+): Promise<void> {
+  const pool = { size: 2, spawn: spawnNode, ...options.pool };
+  const clip = await Clip.open(src, { firstPauseMs: 5, timeoutMs: 500, ...options, pool });
+  try {
+    await body(clip);
+  } finally {
+    clip.close();
+  }
+}
+
+/** Wait until something holds, looking again whenever something has arrived; take all texels meanwhile. */
+async function until(
+  clip: Clip,
+  holds: () => unknown,
+  taken: (scene: SceneStream, rows: TexelRows) => void = () => {},
+) {
+  for (;;) {
+    for (const one of clip.scenes) for (const rows of one.take(Number.POSITIVE_INFINITY)) taken(one, rows);
+    if (holds()) return;
+    if (clip.error) throw clip.error;
+    await new Promise<void>((resolve) => {
+      const wake = () => {
+        clip.removeEventListener('arrived', wake);
+        clearTimeout(timer);
+        resolve();
+      };
+      const timer = setTimeout(wake, 20);
+      clip.addEventListener('arrived', wake);
+    });
+  }
+}
+
+/** Compare a scene that has arrived with one that was decoded at once. */
+async function hasAll(clip: Clip, expected: Scene): Promise<void> {
+  const planes = expected.planes();
+  await until(
+    clip,
+    () => clip.isSettled,
+    (_, rows) => {
+      const { symbols, head } = planes[rows.scale][rows.plane] as { symbols: Int8Array; head: PlaneHead };
+      const texels = layerTexels(symbols, head);
+      const length = 4 * rows.layers * rows.columns;
+      const from = rows.firstRow * length;
+      assert.deepEqual(rows.texels, texels.subarray(from, from + rows.rowCount * length));
+    },
+  );
+  const [stream] = clip.scenes;
+  assert.equal(stream.completeScales, expected.head.scales.length);
+  for (const [scale, found] of planes.entries()) {
+    for (const name of PLANES) {
+      const plane = found[name];
+      if (!plane || !isTimePlane(name)) continue;
+      const values = core.dequantise(plane.symbols, plane.head.step, plane.head.offset);
+      const { rows, columns, channels } = plane.head;
+      for (const row of [0, 1, rows - 1]) {
+        const expectedRow = values.subarray(row * columns * channels, (row + 1) * columns * channels);
+        assert.deepEqual(stream.row(scale, name, rows > 1 ? row / (rows - 1) : 0).length, expectedRow.length);
+        for (const [k, value] of stream.row(scale, name, row / (rows - 1)).entries()) {
+          assert.ok(Math.abs(value - expectedRow[k]) < 1e-4);
+        }
+      }
+      const between = stream.row(scale, name, 0.5 / (rows - 1));
+      for (let k = 0; k < columns * channels; k++) {
+        assert.ok(Math.abs(between[k] - (values[k] + values[k + columns * channels]) / 2) < 1e-4);
+      }
+    }
+  }
+}
+
+test('plays the sample from memory and from a server', async () => {
+  const expected = new Scene(SAMPLE, core);
+  await withClip(SAMPLE.buffer.slice(0), {}, (clip) => hasAll(clip, expected));
+  await withServer(SAMPLE, {}, async (server) => {
+    await withClip(server.url, {}, async (clip) => {
+      assert.equal(clip.fps, 12);
+      assert.equal(clip.duration, 29 / 12);
+      assert.deepEqual(clip.cameras, expected.cameras);
+      assert.deepEqual(clip.metadata, expected.metadata);
+      assert.deepEqual(clip.buffered, []);
+      await hasAll(clip, expected);
+      assert.deepEqual(clip.buffered, [[0, clip.duration]]);
+      assert.equal(clip.message, null);
+      assert.equal(clip.notice, null);
+      assert.equal(server.requests.length, 1);
+    });
+  });
+});
+
+for (const [name, faults] of Object.entries({
+  'has no ranges': { hasRanges: false },
+  compresses: { hasRanges: false, isCompressed: true, saysLength: false },
+  'says nothing': { saysRange: false, etag: null },
+  'breaks off': { cuts: [50_000, 100_000, 70_000, 0, 30_000] },
+  'is overloaded': { statuses: [503, 503] },
+})) {
+  test(`plays from a server that ${name}`, async () => {
+    await withServer(LONG, faults, async (server) => {
+      await withClip(server.url, {}, (clip) => hasAll(clip, new Scene(LONG, core)));
+    });
+  });
+}
+
+test('the coarse picture comes first, then a finer one, then what is ahead', async () => {
+  const { index } = new Container(LONG);
+  const finer = index.findIndex((entry) => entry.scale === 1);
+  await withServer(LONG, { allowed: index[finer + 2].offset }, async (server) => {
+    await withClip(server.url, { timeoutMs: 10_000 }, async (clip) => {
+      clip.setPlayhead({ time: 0, rate: 1 });
+      const scales: number[] = [];
+      const [stream] = clip.scenes;
+      await until(
+        clip,
+        () => clip.canShow(0),
+        (_, rows) => scales.push(rows.scale),
+      );
+      assert.equal(stream.completeScales, 1);
+      const [[start, end], ...others] = clip.buffered;
+      assert.ok(start === 0 && end > 6 && end < 7 && others.length === 0, `${clip.buffered}`);
+      server.allowed = Number.MAX_SAFE_INTEGER;
+      await until(
+        clip,
+        () => stream.completeScales === 2 && clip.canShow(0),
+        (_, rows) => scales.push(rows.scale),
+      );
+      assert.deepEqual(scales, [...scales].sort());
+      await until(clip, () => clip.isSettled);
+    });
+  });
+});
+
+test('a jump fetches what the picture needs before what lies in between', async () => {
+  await withServer(LONG, { rate: 400_000 }, async (server) => {
+    await withClip(server.url, {}, async (clip) => {
+      await until(clip, () => clip.canShow(0));
+      const before = clip.receivedBytes;
+      const atJump = server.requests.length;
+      clip.setPlayhead({ time: 70, rate: 1 });
+      assert.ok(!clip.canShow(70));
+      await until(clip, () => clip.canShow(70));
+      assert.ok(clip.receivedBytes - before < 150_000, `${clip.receivedBytes - before} bytes`);
+      const { index } = new Container(LONG);
+      const firstRow = Math.floor(0.7 * 511);
+      const wanted = index.find((e) => e.plane > 2 && e.rowStart <= firstRow && firstRow < e.rowStart + e.rowCount);
+      const [from, to] = server.requests[atJump].split('-').map(Number);
+      assert.ok(from <= (wanted?.offset ?? 0) && (wanted?.offset ?? 0) < to, server.requests.join(' '));
+      assert.ok(
+        clip.buffered.some(([start, end]) => start <= 70 && 70 < end),
+        `${clip.buffered}`,
+      );
+    });
+  });
+});
+
+test('a long scene plays in little memory, and what was dropped comes again', async () => {
+  const all = new Scene(LONG, core).head.valueCount;
+  const pool = { memory: 2 << 20 };
+  await withServer(LONG, {}, async (server) => {
+    let memory = 0;
+    await withClip(server.url, { pool }, async (clip) => {
+      memory = clip.memoryBytes - clip.scenes[0].heldBytes + Math.round(0.4 * all);
+    });
+    await withClip(server.url, { memory, pool }, async (clip) => {
+      const [stream] = clip.scenes;
+      for (const time of [0, 20, 40, 60, 80, 99, 0, 50]) {
+        clip.setPlayhead({ time, rate: 1 });
+        await until(clip, () => clip.canShow(time) && stream.isSettled);
+        assert.ok(clip.memoryBytes <= memory, `${clip.memoryBytes}`);
+        assert.ok(stream.row(1, 'xt', time / clip.duration).some((value) => value !== 1));
+      }
+      clip.setPlayhead({ time: 0 });
+      await until(clip, () => stream.isSettled);
+      assert.ok(stream.row(1, 'xt', 0.9).every((value) => value === 1));
+    });
+    await assert.rejects(
+      withClip(server.url, { memory: 4 << 20 }, async () => {}),
+      hasCode('budget'),
+    );
+  });
+});
+
+test('groups are opened ahead, blended, and released behind the playhead', async () => {
+  const group = scene({ ...SHORT, frameCount: 101, segmentRows: 32 });
+  const { valueCount } = new Container(group).header;
+  const clipFile = grouped([group, group, group, group, group], 101, 11, valueCount);
+  const memory = 64 << 20;
+  await withServer(clipFile, {}, async (server) => {
+    await withClip(server.url, { memory }, async (clip) => {
+      assert.equal(clip.frameCount, 461);
+      const events: string[] = [];
+      for (const type of ['open', 'release']) {
+        clip.addEventListener(type, (event) => events.push(`${type} ${(event as SceneEvent).scene.group}`));
+      }
+      for (let time = 0; time < clip.duration; time += 0.25) {
+        clip.setPlayhead({ time, rate: 1 });
+        await until(clip, () => {
+          clip.setPlayhead({ time, rate: 1 });
+          return clip.canShow(time);
+        });
+        const parts = clip.parts(time);
+        assert.deepEqual(
+          parts.map(({ scene: one, share, time: localTime }) => ({ group: one.group, localTime, share })),
+          clip.timeline.blendAt(time / clip.duration),
+        );
+        assert.ok(clip.scenes.length <= 2);
+        assert.ok(clip.memoryBytes <= memory, `${clip.memoryBytes}`);
+        assert.ok(
+          clip.buffered.some(([start, end]) => start <= time && time <= end),
+          `${time} of ${clip.buffered}`,
+        );
+      }
+      const order = [1, 2, 3, 4].flatMap((number) => [`open ${number}`, `release ${number - 1}`]);
+      assert.deepEqual(
+        events.filter((event) => event !== 'open 0' && event !== 'release 3').slice(0, 7),
+        order.slice(0, 7),
+      );
+      clip.setPlayhead({ time: 15, rate: 0 });
+      await until(clip, () => {
+        clip.setPlayhead({ time: 15, rate: 0 });
+        return clip.canShow(15);
+      });
+      assert.equal(clip.parts(15)[0].scene.group, 1);
+    });
+  });
+});
+
+test('a damaged chunk is fetched again, and reported if it stays so', async () => {
+  const damaged = LONG.slice();
+  const entry = new Container(LONG).index[12];
+  damaged[entry.offset + 5] ^= 1;
+  await withServer(damaged, { etag: null }, async (server) => {
+    await withClip(server.url, {}, async (clip) => {
+      clip.addEventListener('arrived', () => {});
+      let errors = 0;
+      clip.addEventListener('error', () => errors++);
+      await assert.rejects(
+        until(clip, () => clip.isSettled && !clip.error),
+        hasCode('damaged', 'chunk 12'),
+      );
+      assert.equal(errors, 1);
+      assert.ok(clip.message?.startsWith('loading stopped'));
+    });
+    await withClip(server.url, {}, async (clip) => {
+      const asked = `${entry.offset}-${entry.offset + entry.storedLength - 1}`;
+      await until(clip, () => {
+        if (clip.receivedBytes > 0) server.bytes = LONG;
+        return clip.isSettled;
+      });
+      assert.ok(server.requests.filter((range) => range === asked).length > 0);
+    });
+  });
+});
+
+test('a file that is cut off plays as far as it goes', async () => {
+  const { index } = new Container(LONG);
+  const cut = LONG.slice(0, index[40].offset + 10);
+  await withServer(cut, {}, async (server) => {
+    await withClip(server.url, {}, async (clip) => {
+      await until(clip, () => clip.isSettled);
+      assert.ok(clip.notice?.includes('cut off'));
+      assert.ok(clip.buffered[0][1] < clip.duration);
+      assert.equal(clip.error, null);
+    });
+  });
+});
+
+test('what cannot be opened says why', async () => {
+  const open = (bytes: Uint8Array) => withServer(bytes, {}, (server) => withClip(server.url, {}, async () => {}));
+  await assert.rejects(open(new TextEncoder().encode('<!doctype html>')), hasCode('foreign'));
+  await assert.rejects(open(read('spec/vectors/invalid/draft-1.kpc')), hasCode('draft'));
+  await assert.rejects(open(SAMPLE.slice(0, 2000)), hasCode('cut-off'));
+  const newer = SAMPLE.slice();
+  newer[8] = 2;
+  await assert.rejects(open(newer), hasCode('newer'));
+  const trailing = new Uint8Array(SAMPLE.length + 1);
+  trailing.set(SAMPLE);
+  await assert.rejects(open(trailing), hasCode('invalid', '1 bytes follow'));
+  await assert.rejects(
+    withClip('no address', {}, async () => {}),
+    hasCode('not-found'),
+  );
+  const control = new AbortController();
+  control.abort();
+  await withServer(SAMPLE, {}, async (server) => {
+    await assert.rejects(
+      withClip(server.url, { signal: control.signal }, async () => {}),
+      hasCode('aborted'),
+    );
+  });
+});
+
+test('space planes come again for a renderer that has lost them', async () => {
+  await withServer(LONG, {}, async (server) => {
+    await withClip(server.url, {}, async (clip) => {
+      await until(clip, () => clip.isSettled);
+      const [stream] = clip.scenes;
+      stream.restore();
+      assert.equal(stream.completeScales, 0);
+      let planes = 0;
+      await until(
+        clip,
+        () => clip.isSettled,
+        () => planes++,
+      );
+      assert.equal(planes, 6);
+    });
+  });
+});
+
+test('texels are taken row by row', async () => {
+  await withClip(SAMPLE.buffer.slice(0), {}, async (clip) => {
+    const [stream] = clip.scenes;
+    const rows: TexelRows[] = [];
+    while (rows.length < 60) {
+      const found = stream.take(1);
+      rows.push(...found);
+      if (found.length === 0) await new Promise((resolve) => setTimeout(resolve, 5));
+      else assert.deepEqual([found.length, found[0].rowCount], [1, 1]);
+    }
+    assert.deepEqual(
+      rows.slice(0, 51).map((one) => one.firstRow),
+      [...Array(51).keys()],
+    );
+    assert.equal(rows[51].firstRow, 0);
+  });
+});
+
+test('a closed clip asks for nothing more', async () => {
+  await withServer(LONG, { rate: 300_000 }, async (server) => {
+    await withClip(server.url, {}, async (clip) => {
+      await until(clip, () => clip.receivedBytes > 70_000);
+      clip.close();
+      const { length } = server.requests;
+      clip.setPlayhead({ time: 50 });
+      await new Promise((resolve) => setTimeout(resolve, 100));
+      assert.equal(server.requests.length, length);
+    });
+  });
+});
