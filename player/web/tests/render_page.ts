@@ -5,8 +5,10 @@ import { Core } from '../src/decoder/core.js';
 import { Layout } from '../src/render/atlas.js';
 import type { Camera } from '../src/render/camera.js';
 import type { DrawnScene } from '../src/render/drawn_scene.js';
+import type { Rung } from '../src/render/pace.js';
+import type { Moment, ShownPart } from '../src/render/picture_job.js';
 import { LEVELS, type Level } from '../src/render/quality.js';
-import { type Moment, Renderer, type ShownPart } from '../src/render/renderer.js';
+import { Renderer } from '../src/render/renderer.js';
 import { sceneDefines } from '../src/render/scene_textures.js';
 import { type Composed, compose, constants, type Defines } from '../src/render/shader.js';
 import { blockArrays, decoderArrays } from '../src/render/shader_constants.js';
@@ -17,7 +19,7 @@ export interface Job {
   file: string;
   camera: Camera;
   time: number; // in [0, 1] of the clip
-  level: Level | 'auto';
+  level: Level | Rung | 'auto';
   part?: ShownPart;
   appearance?: string | null;
   halfFloat?: boolean;
@@ -102,6 +104,17 @@ const page = {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
     return { pixels: base64(pixels), error: gl.getError(), name: renderer.name };
+  },
+
+  /** Draw the rays of a picture; return how much that looks up, and its colours as float32 RGBA in base64. */
+  async counted(job: Job) {
+    const { renderer, moments, appearance } = await prepared(job);
+    const options = { level: job.level, part: job.part, appearance, isCounted: true };
+    const rasters = await renderer.read(job.camera, moments, options);
+    const sum = (channel: number) =>
+      rasters.reduce((all, { sums }) => all + sums.reduce((s, x, i) => (i % 4 === channel ? s + x : s), 0), 0);
+    const [{ width, height }] = rasters;
+    return { width, height, samples: sum(1), cells: sum(2), rays: width * height * rasters.length };
   },
 
   /** Draw pictures one after the other; return the milliseconds that each took. */

@@ -31,15 +31,18 @@ export function columnsOf(pose: ArrayLike<number>): number[] {
   return [0, 1, 2, 3].flatMap((column) => [pose[column], pose[column + 4], pose[column + 8]]);
 }
 
-/** Return how many texels of the finest scale a pixel spans in the middle of the box of an unmapped scene. */
+/**
+ * Return how many texels of the finest scale a pixel spans: in the middle of the box; in device coordinates about, taking
+ * the planes to be as wide as the picture.
+ */
 export function texelsPerPixel(scene: SceneSource, camera: Camera): number {
   const { aabb, scales } = scene.head;
+  const finest = scales[scales.length - 1];
+  const sizes = SPACE_PLANES.map((name) => headOf(finest, name)).flatMap(({ columns, rows }) => [columns, rows]);
+  const across = Math.max(1, ...sizes.map((size) => size - 1));
+  if (scene.mapping?.mapping === 2) return across / Math.max(camera.width, camera.height);
+  const inBox = scene.mapping === null ? across : across / 2; // the box is half of contracted space
   const place = columnsOf(camera.pose).slice(9);
   const distance = Math.hypot(...place.map((x, axis) => (aabb[axis] + aabb[axis + 3]) / 2 - x));
-  const finest = scales[scales.length - 1];
-  const across = SPACE_PLANES.map((name) => headOf(finest, name)).flatMap(({ columns, rows }) => [
-    columns - 1,
-    rows - 1,
-  ]);
-  return distance / Math.min(camera.focal[0], camera.focal[1]) / (extentOf(scene) / Math.max(1, ...across));
+  return (distance / Math.min(camera.focal[0], camera.focal[1])) * (inBox / extentOf(scene));
 }

@@ -8,11 +8,32 @@ export interface Rung {
   scale: number;
 }
 
-/** From the fastest to the finest; below full size the fastest level alone. What each is worth: docs/benchmarks.md. */
-export const RUNGS: readonly Rung[] = [
-  ...[0.35, 0.42, 0.5, 0.6, 0.7, 0.84].map((scale) => ({ level: 'fastest' as const, scale })),
-  ...(['fastest', 'faster', 'fast', 'balanced', 'fine', 'finer'] as const).map((level) => ({ level, scale: 1 })),
-];
+/** Sides of rasters over that of the picture. */
+const SIDES = Array.from({ length: 15 }, (_, i) => 2 ** ((i - 14) / 4));
+/**
+ * Where a pixel of the raster spans so many texels, longer steps cost the picture less than a coarser raster would;
+ * the second number is where they cost more. Figures: docs/benchmarks.md, "Drawing in a browser".
+ */
+const COARSE_TEXELS = [1.7, 2];
+
+/** Return the rungs for pictures whose pixels span so many texels of the finest scale, from the fastest on. */
+export function rungsOf(texelsPerPixel: number): Rung[] {
+  const [least, most] = COARSE_TEXELS;
+  const rungs = (level: Level, sides: number[]) =>
+    sides.map((side) => ({ level, scale: side / LEVELS[level].resolution }));
+  return [
+    ...rungs(
+      'fastest',
+      SIDES.filter((side) => texelsPerPixel >= least * side),
+    ),
+    ...rungs(
+      'faster',
+      SIDES.filter((side) => side < 1 && texelsPerPixel <= most * side),
+    ),
+    ...rungs('balanced', [1]),
+    ...rungs('fine', [1]),
+  ];
+}
 
 // Share of the time of a frame that drawing may take, and above which it is too slow.
 const IN_TIME = 0.8;
@@ -20,58 +41,60 @@ const TOO_SLOW = 1.05;
 // Frames on a rung before a coarser or a finer one: slow frames disturb at once, a finer picture can wait.
 const DOWN_AFTER = 2;
 const UP_AFTER = 8;
-// Frames for which the time of a rung is remembered that proved too slow.
+// Frames for which the cost of what proved too slow is remembered.
 const REMEMBERED = 300;
 
-/** Return the pixels that are marched for each of the picture's, times samples for each of the scene's steps. */
-export function costOf({ level, scale }: Rung): number {
-  const { resolution, step } = LEVELS[level];
-  return (resolution * scale) ** 2 / step;
+/** Return the rays that are marched for each pixel that spans so many texels, those of longer steps counting less. */
+export function costOf({ level, scale }: Rung, texelsPerPixel: number): number {
+  const { resolution, step, raysAcross } = LEVELS[level];
+  const rays = Math.max(1, Math.min(Math.floor(texelsPerPixel), raysAcross));
+  return (rays * resolution * scale) ** 2 / step;
 }
 
 /** Chooses a rung by how long frames took. */
 export class Pace {
-  #at: number;
+  /** In which a frame is to be drawn. */
+  secondsPerFrame: number;
+  /** Rays for each pixel that there is time for, as far as is known. */
+  #affordable: number;
   #recent: number[] = [];
   #frames = 0;
-  readonly #tooSlow = new Map<number, number>(); // rung to the frame until which it counts as too slow
+  #tooMuch = { cost: Number.POSITIVE_INFINITY, until: 0 };
 
-  /** @param secondsPerFrame in which a frame is to be drawn. */
-  constructor(
-    public secondsPerFrame: number,
-    first = 0,
-  ) {
-    this.#at = first;
+  /** @param affordable rays for each pixel of the first pictures. */
+  constructor(secondsPerFrame: number, affordable: number) {
+    this.secondsPerFrame = secondsPerFrame;
+    this.#affordable = affordable;
   }
 
-  get rung(): Rung {
-    return RUNGS[this.#at];
+  /** Return the finest rung for which there is time. */
+  rung(texelsPerPixel: number): Rung {
+    const [fastest, ...finer] = rungsOf(texelsPerPixel);
+    return finer.reduce((best, rung) => (this.#isAffordable(costOf(rung, texelsPerPixel)) ? rung : best), fastest);
   }
 
-  /** Take the time that a frame of the present rung took, and choose the next one. */
-  record(seconds: number): void {
+  /** Take the time of a picture, and how many rays were marched for each of its pixels. */
+  record(cost: number, seconds: number): void {
     this.#frames++;
-    this.#recent.push(seconds);
+    this.#recent.push(seconds / cost);
     const typical = median(this.#recent.slice(-DOWN_AFTER));
-    const expected = (rung: number) => (typical * costOf(RUNGS[rung])) / costOf(this.rung);
-    if (this.#recent.length >= DOWN_AFTER && typical > TOO_SLOW * this.secondsPerFrame && this.#at > 0) {
-      this.#tooSlow.set(this.#at, this.#frames + REMEMBERED);
-      let next = this.#at - 1;
-      while (next > 0 && expected(next) > IN_TIME * this.secondsPerFrame) next--;
-      this.#move(next);
+    const isTooSlow = typical * cost > TOO_SLOW * this.secondsPerFrame;
+    if (this.#recent.length >= DOWN_AFTER && isTooSlow) {
+      this.#tooMuch = { cost, until: this.#frames + REMEMBERED };
+      this.#settle((IN_TIME * this.secondsPerFrame) / typical);
     } else if (this.#recent.length >= UP_AFTER) {
-      let next = this.#at;
-      while (next + 1 < RUNGS.length && this.#isAffordable(next + 1, expected(next + 1))) next++;
-      this.#move(next);
+      const affordable = (IN_TIME * this.secondsPerFrame) / median(this.#recent);
+      this.#settle(Math.max(affordable, cost));
     }
   }
 
-  #isAffordable(rung: number, seconds: number): boolean {
-    return seconds < IN_TIME * this.secondsPerFrame && (this.#tooSlow.get(rung) ?? 0) < this.#frames;
+  #isAffordable(cost: number): boolean {
+    const isTooMuch = cost >= this.#tooMuch.cost && this.#frames < this.#tooMuch.until;
+    return cost <= this.#affordable && !isTooMuch;
   }
 
-  #move(rung: number): void {
-    this.#at = rung;
+  #settle(affordable: number): void {
+    this.#affordable = affordable;
     this.#recent = [];
   }
 }

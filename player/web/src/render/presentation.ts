@@ -13,17 +13,20 @@ export interface Screen {
   height: number;
 }
 
-/** A picture, rows from below: colour and opacity; sum of weight times distance, number of samples and of look-ups. */
+/**
+ * A picture, rows from below: colour and opacity; if it is exact also the sum of weight times distance, and the numbers
+ * of samples and of look-ups.
+ */
 export interface Target extends Framebuffer {
   readonly rgba: Texture;
-  readonly sums: Texture;
+  readonly sums: Texture | null;
 }
 
 /** What of pictures to show; the value is MODE of present.glsl. */
 export const SHOWN = { colour: 0, difference: 1 } as const;
 
-// Targets that are kept for the next use of their size.
-const TARGETS_KEPT = 6;
+// Targets that are kept for the next use of their size: a picture of two groups, the next one, and a still one.
+const TARGETS_KEPT = 8;
 
 export class Presentation {
   readonly #programs = new Map<string, Program>();
@@ -33,9 +36,9 @@ export class Presentation {
   constructor(readonly device: Device) {}
 
   /** Return a target of a size; the last used are kept. */
-  target(name: string, width: number, height: number): Target {
-    const key = `${name} ${width} ${height}`;
-    const target = this.#targets.get(key) ?? this.#newTarget(width, height);
+  target(name: string, width: number, height: number, isExact: boolean): Target {
+    const key = `${name} ${width} ${height} ${isExact}`;
+    const target = this.#targets.get(key) ?? this.#newTarget(width, height, isExact);
     this.#targets.delete(key);
     this.#targets.set(key, target);
     if (this.#targets.size > TARGETS_KEPT) {
@@ -51,7 +54,7 @@ export class Presentation {
     const program = this.#program('average.glsl');
     this.device.set(program, { rgba_rays: UNIT.rgba, sums_rays: UNIT.sums, rays_across: raysAcross });
     this.device.use(marched.rgba, UNIT.rgba);
-    this.device.use(marched.sums, UNIT.sums);
+    this.device.use(marched.sums ?? marched.rgba, UNIT.sums);
     this.device.draw(program, target.handle, [0, 0, target.width, target.height]);
     return target;
   }
@@ -78,7 +81,7 @@ export class Presentation {
       opacity: canvas ? 1 : opacity,
     });
     device.use(picture.rgba, UNIT.rgba);
-    device.use(picture.sums, UNIT.sums);
+    device.use(picture.sums ?? picture.rgba, UNIT.sums);
     device.use((still ?? picture).rgba, UNIT.staticRgba);
     if (canvas === null) {
       device.draw(present, screen.framebuffer, viewport, { isBlended });
@@ -106,19 +109,20 @@ export class Presentation {
     return program;
   }
 
-  #newTarget(width: number, height: number): Target {
+  #newTarget(width: number, height: number, isExact: boolean): Target {
     const { device } = this;
     if (Math.max(width, height) > device.maxTextureSize) {
       throw new RenderError(`a picture of ${width}x${height} is larger than ${device.name} takes`);
     }
-    const isFloat32 = device.drawsFloat32;
-    const rgba = device.texture(isFloat32 ? 'rgba32f' : 'rgba16f', [width, height], false);
-    const sums = device.texture(isFloat32 ? 'rgba32f' : 'rgba16f', [width, height], false);
-    return { ...device.framebuffer([rgba, sums]), rgba, sums };
+    const format = device.drawsFloat32 && isExact ? 'rgba32f' : 'rgba16f';
+    const rgba = device.texture(format, [width, height], false);
+    const sums = isExact ? device.texture(format, [width, height], false) : null;
+    return { ...device.framebuffer(sums ? [rgba, sums] : [rgba]), rgba, sums };
   }
 
   #release(target: Target): void {
-    for (const object of [target.rgba, target.sums]) this.device.release(object);
+    this.device.release(target.rgba);
+    if (target.sums) this.device.release(target.sums);
     this.device.release({ handle: target.handle, width: target.width, height: target.height });
   }
 

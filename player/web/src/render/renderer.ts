@@ -7,27 +7,19 @@
  *     renderer.dispose();
  */
 
-import { type Camera, isSameView, resized, texelsPerPixel } from './camera.js';
+import { type Camera, isSameView, texelsPerPixel } from './camera.js';
 import { Device, RenderError } from './device.js';
-import { DrawnScene, type Shot } from './drawn_scene.js';
+import { DrawnScene } from './drawn_scene.js';
 import { Pace, type Rung } from './pace.js';
-import { Presentation, type Screen, type Target } from './presentation.js';
-import { LEVELS, type Level, type Quality } from './quality.js';
+import { type Keeping, type Moment, type Picture, PictureJob, type ShownPart, type View } from './picture_job.js';
+import { Presentation, type Screen } from './presentation.js';
+import type { Level } from './quality.js';
 import type { SceneSource } from './scene_source.js';
 import { Timer } from './timer.js';
 
-export type ShownPart = 'all' | 'static' | 'dynamic';
-
-/** A scene at a time in [0, 1] of its own, and its share of the picture: 1, or two groups' that make 1 together. */
-export interface Moment {
-  scene: DrawnScene;
-  time: number;
-  share: number;
-}
-
 export interface DrawOptions {
   /** `auto` takes the finest level at which frames come in time, and draws finely once all stands still. */
-  level?: Level | 'auto';
+  level?: Level | Rung | 'auto';
   /** `dynamic` shows the difference between all and the static part. */
   part?: ShownPart;
   /** An embedding of the scene, or between two of them; null is the average appearance. */
@@ -57,23 +49,25 @@ export interface RendererOptions {
 
 /** What is drawn once all stands still. */
 const STILL: Rung = { level: 'fine', scale: 1 };
-/** Pixels of a raster with several rays a pixel, at most. */
-const MOST_PIXELS = 1 << 22;
+/** Seconds that a part of a picture may take, so that the page stays alive and drivers do not think that all hangs. */
+const MOST_SECONDS = 0.25;
+/** Seconds for a ray, until it is known: of a card, and of a processor in its place. */
+const ASSUMED_SECONDS = { card: 2e-7, processor: 1e-5 };
+/** Rays for a pixel of the first pictures on a card, before it is known how fast it is. */
+const FIRST_RAYS = 0.1;
+/** How fast what is known of it follows what is measured. */
+const NEW_WEIGHT = 0.5;
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
+const LIVE = ['live', 'other live'];
+const STILL_ROLE = 'still';
 
-/** A picture that is marched in strips over several calls. */
-interface Sharpening {
-  nextRow: number;
-  rowsAtOnce: number;
-}
-
-/** What decides what a picture shows. */
-interface Request {
-  camera: Camera;
-  moments: readonly Moment[];
-  options: DrawOptions;
-  /** Of the scenes' planes. */
-  version: string;
+/** A finished picture, what it shows, and of what versions of the scenes' planes. */
+interface Shown {
+  view: View;
+  versions: string;
+  rung: Rung;
+  role: string;
+  pictures: Picture[];
 }
 
 export class Renderer {
@@ -84,8 +78,9 @@ export class Renderer {
   #device: Device;
   #presentation: Presentation;
   #timer: Timer;
-  #last: { request: Request; rung: Rung } | null = null;
-  #sharpening: Sharpening | null = null;
+  #shown: Shown | null = null;
+  #job: (PictureJob & { versions?: string }) | null = null;
+  #secondsPerRay: number;
   #isDisposed = false;
 
   /**
@@ -94,10 +89,11 @@ export class Renderer {
   constructor(canvasOrGl: HTMLCanvasElement | OffscreenCanvas | WebGL2RenderingContext, options: RendererOptions = {}) {
     this.gl = 'getContext' in canvasOrGl ? contextOf(canvasOrGl) : canvasOrGl;
     this.#options = options;
-    this.pace = new Pace(1 / (options.fps ?? 30));
     this.#device = new Device(this.gl, options);
     this.#presentation = new Presentation(this.#device);
     this.#timer = new Timer(this.gl, this.isSoftware);
+    this.pace = new Pace(1 / (options.fps ?? 30), this.isSoftware ? 0 : FIRST_RAYS);
+    this.#secondsPerRay = this.isSoftware ? ASSUMED_SECONDS.processor : ASSUMED_SECONDS.card;
     this.gl.canvas.addEventListener('webglcontextlost', this.#onLost);
     this.gl.canvas.addEventListener('webglcontextrestored', this.#onRestored);
   }
@@ -142,52 +138,70 @@ export class Renderer {
     if (this.#scenes.delete(scene)) scene.release();
   }
 
-  /** Draw what a camera sees. While the card is still busy with the picture before, or is lost, nothing is drawn. */
+  /**
+   * Draw what a camera sees, or go on with that; call it on each animation frame until the picture is sharp.
+   *
+   * A picture that takes long is made in several calls, and shown once it is whole. While the card is busy with what it
+   * was given last, or is lost, nothing is done.
+   */
   draw(camera: Camera, moments: readonly Moment[], options: DrawOptions = {}): DrawnPicture {
-    if (!this.isLost) for (const { scene } of moments) scene.upload(this.#device);
-    const request = { camera, moments, options, version: versionOf(moments) };
-    const isSame = this.#last !== null && isSameRequest(this.#last.request, request);
-    const isAuto = (options.level ?? 'auto') === 'auto';
-    const chosen: Rung = isAuto ? this.pace.rung : { level: options.level as Level, scale: 1 };
-    if (this.isLost || this.#timer.isBusy) return { ...(this.#last?.rung ?? chosen), isSharp: false };
-    if (isSame && this.#last !== null) {
-      const isDone = !isAuto || this.#last.rung === STILL;
-      if (!isDone) this.#sharpen(request);
-      else if (options.screen) this.present();
-      return { ...this.#last.rung, isSharp: isDone || this.#last.rung === STILL };
+    const { level = 'auto' } = options;
+    const isAuto = level === 'auto';
+    const wanted = isAuto ? this.pace.rung(texelsPerPixel(moments[0].scene.source, camera)) : rungOf(level);
+    if (this.isLost || this.#timer.isBusy) return this.#state(wanted, false);
+    for (const { scene } of moments) scene.upload(this.#device);
+    const view = viewOf(camera, moments, options);
+    const versions = moments.map(({ scene }) => scene.version).join();
+    const isStill = this.#shown !== null && isSame(this.#shown.view, view);
+    const isShown = isStill && this.#shown?.versions === versions;
+    if (this.#job?.role === STILL_ROLE && !isSame(this.#job.view, view)) this.#job = null;
+    if (this.#job === null) {
+      const isSharp = isShown && (isAuto ? this.#shown?.rung === STILL : isSameRung(this.#shown?.rung, wanted));
+      if (isSharp) {
+        if (options.screen) this.present(options.screen);
+        return this.#state(wanted, true);
+      }
+      // What was sharp stays so while more planes arrive.
+      const sharpens = isAuto && (isShown || (isStill && this.#shown?.rung === STILL));
+      this.#job = this.#newJob(view, sharpens ? STILL : wanted);
+      this.#job.versions = versions;
     }
-    this.#sharpening = null;
-    this.#timer.start();
-    for (const shot of this.#shots(request, chosen)) shot.scene.march(this.#device, shot.target, shot);
-    this.#show(request, chosen);
-    this.#timer.finish((seconds) => {
-      if (isAuto) this.pace.record(seconds);
-    });
-    this.#last = { request, rung: chosen };
-    return { ...chosen, isSharp: !isAuto };
+    this.#goOn(this.#job, isAuto, options.screen ?? null);
+    return this.#state(wanted, false);
   }
 
   /** Show the last picture again: a browser clears a canvas once it has shown it, so do this to read pixels. */
-  present(): void {
-    if (this.#last !== null && !this.isLost) this.#show(this.#last.request, this.#last.rung);
+  present(screen: Screen | null = null): void {
+    if (this.isLost || this.#shown === null) return;
+    const { drawingBufferWidth: width, drawingBufferHeight: height } = this.gl;
+    const whole = screen ?? { framebuffer: null, x: 0, y: 0, width, height };
+    for (const [number, { target, still, share }] of this.#shown.pictures.entries()) {
+      this.#presentation.show(whole, target, still, number === 0 ? 1 : share);
+    }
   }
 
   /**
-   * Draw a picture of the camera's size, at once and by itself.
-   * @returns float32 RGBA (opacity in A), and the mean distance, number of samples and of cells looked up in RGB, rows
-   *   from below.
+   * Draw a picture by itself, in float numbers, without showing it; `draw` does nothing meanwhile.
+   * @returns for each moment, and with part `dynamic` its static part, RGBA of colour and opacity; and RGBA of the sum
+   *   of weight times distance, the number of samples and, if asked for, of cells looked up. Rows from below; one for
+   *   each ray, which may be more or less than pixels.
    */
-  read(camera: Camera, moments: readonly Moment[], options: DrawOptions & { isCounted?: boolean } = {}) {
-    if (this.isLost) throw new RenderError('the card is lost for the moment');
-    const level = options.level === undefined || options.level === 'auto' ? STILL.level : options.level;
-    const request = { camera, moments, options, version: versionOf(moments) };
-    const shots = this.#shots(request, { level, scale: 1 }, 'read ');
-    const pictures = shots.map((shot) => {
-      shot.scene.march(this.#device, shot.target, { ...shot, isCounted: options.isCounted });
-      return [0, 1].map((attachment) => this.#device.read(shot.target, attachment));
+  async read(camera: Camera, moments: readonly Moment[], options: DrawOptions & { isCounted?: boolean } = {}) {
+    const { level = 'auto' } = options;
+    const rung = level === 'auto' ? STILL : rungOf(level);
+    const keeping = { role: 'read', isExact: true, isCounted: options.isCounted ?? false };
+    await this.#untilIdle();
+    for (const { scene } of moments) scene.upload(this.#device);
+    const job = new PictureJob(viewOf(camera, moments, options), rung, this.#presentation, keeping);
+    while (job.rowsLeft > 0) {
+      this.#march(job, MOST_SECONDS, () => {});
+      this.#timer.finish();
+      await this.#untilIdle();
+    }
+    return job.targets.map((target) => {
+      const [rgba, sums] = [0, 1].map((attachment) => this.#device.read(target, attachment));
+      return { width: target.width, height: target.height, rgba, sums };
     });
-    const { width, height } = shots[0].target;
-    return { width, height, pictures };
   }
 
   /** Give back everything on the card. */
@@ -203,85 +217,49 @@ export class Renderer {
     this.#device.dispose();
   }
 
-  /** March some rows of the still picture, and show it once all are there. */
-  #sharpen(request: Request): void {
-    const shots = this.#shots(request, STILL);
-    const state = this.#sharpening ?? { nextRow: 0, rowsAtOnce: 8 };
-    this.#sharpening = state;
-    const rows = shots.reduce((sum, { target }) => sum + target.height, 0);
-    let [first, more] = [state.nextRow, state.rowsAtOnce];
-    this.#timer.start();
-    for (const shot of shots) {
-      const count = Math.max(0, Math.min(more, shot.target.height - first));
-      if (first < shot.target.height && count > 0) shot.scene.march(this.#device, shot.target, shot, first, count);
-      more -= count;
-      first = Math.max(0, first - shot.target.height);
+  #newJob(view: View, rung: Rung): PictureJob {
+    const keeping = (role: string): Keeping => ({ role, isExact: rung.level === 'reference', isCounted: false });
+    if (rung === STILL) return new PictureJob(view, rung, this.#presentation, keeping(STILL_ROLE));
+    const role = this.#shown?.role === LIVE[0] ? LIVE[1] : LIVE[0];
+    return new PictureJob(view, rung, this.#presentation, keeping(role));
+  }
+
+  /** March as many rows as there is time for, and show the picture if these were the last. */
+  #goOn(job: PictureJob & { versions?: string }, isAuto: boolean, screen: Screen | null): void {
+    const isStill = job.role === STILL_ROLE;
+    this.#march(job, isStill ? this.pace.secondsPerFrame : MOST_SECONDS, () => {
+      if (isAuto && !isStill && job.rowsLeft === 0) this.pace.record(job.raysPerPixel, job.seconds);
+    });
+    if (job.rowsLeft === 0) {
+      const { view, rung, role, versions = '' } = job;
+      this.#shown = { view, rung, role, versions, pictures: job.finish(this.#presentation) };
+      this.#job = null;
+      this.present(screen);
+    } else if (screen) {
+      this.present(screen);
     }
-    state.nextRow += state.rowsAtOnce;
-    if (state.nextRow >= rows) {
-      this.#show(request, STILL);
-      this.#last = { request, rung: STILL };
-      this.#sharpening = null;
-    }
-    this.#timer.finish((seconds) => {
-      const factor = this.pace.secondsPerFrame / seconds;
-      state.rowsAtOnce = Math.max(1, Math.round(state.rowsAtOnce * Math.min(Math.max(factor, 0.5), 4)));
-    });
+    this.#timer.finish();
   }
 
-  /** Return what has to be marched for a picture: for each moment the whole scene, its static part, or both. */
-  #shots(
-    { camera, moments, options }: Request,
-    rung: Rung,
-    role = roleOf(rung),
-  ): (Shot & { scene: DrawnScene; target: Target })[] {
-    const { part = 'all', appearance = null, background } = options;
-    const quality = LEVELS[rung.level];
-    const parts = { all: [true], static: [false], dynamic: [true, false] }[part];
-    return moments.flatMap(({ scene, time }, number) => {
-      const raster = rasterOf(scene.source, camera, quality, rung.scale);
-      return parts.map((isMoving) => {
-        const target = this.#presentation.target(`${role}${number} ${isMoving}`, raster.width, raster.height);
-        const colour = background ?? scene.source.head.background;
-        return { scene, camera: raster, time, quality, isMoving, appearance, background: colour, target };
-      });
+  /** Begin to march the rows that take about so many seconds. */
+  #march(job: PictureJob, seconds: number, done: () => void): void {
+    const rays = seconds / this.#secondsPerRay;
+    const rows = Math.min(Math.max(1, Math.floor(rays / job.raysPerRow)), job.rowsLeft);
+    this.#timer.start((took) => {
+      job.seconds += took;
+      this.#secondsPerRay += NEW_WEIGHT * (took / (rows * job.raysPerRow) - this.#secondsPerRay);
+      done();
     });
+    job.march(this.#device, rows);
   }
 
-  /** Bring marched pictures to the screen, those of two groups mixed. */
-  #show(request: Request, rung: Rung): void {
-    const { camera, options } = request;
-    const { width, height } = camera;
-    const screen = options.screen ?? {
-      framebuffer: null,
-      x: 0,
-      y: 0,
-      width: this.gl.drawingBufferWidth,
-      height: this.gl.drawingBufferHeight,
-    };
-    const across = this.#raysAcross(request, rung);
-    const targets = this.#shots(request, rung).map(({ target, isMoving }, number) => {
-      const rays = across[Math.floor((number * request.moments.length) / this.#shotCount(request))];
-      if (rays === 1) return target;
-      return this.#presentation.average(
-        target,
-        this.#presentation.target(`mean ${number} ${isMoving}`, width, height),
-        rays,
-      );
-    });
-    const perMoment = targets.length / request.moments.length;
-    request.moments.forEach(({ share }, number) => {
-      const [picture, still = null] = targets.slice(number * perMoment, (number + 1) * perMoment);
-      this.#presentation.show(screen, picture, still, number === 0 ? 1 : share);
-    });
+  #state(wanted: Rung, isSharp: boolean): DrawnPicture {
+    return { ...(this.#shown?.rung ?? wanted), isSharp };
   }
 
-  #shotCount({ moments, options }: Request): number {
-    return moments.length * (options.part === 'dynamic' ? 2 : 1);
-  }
-
-  #raysAcross({ camera, moments }: Request, rung: Rung): number[] {
-    return moments.map(({ scene }) => raysAcrossOf(scene.source, camera, LEVELS[rung.level]));
+  async #untilIdle(): Promise<void> {
+    while (this.#timer.isBusy) await new Promise((resolve) => setTimeout(resolve, 1));
+    if (this.isLost) throw new RenderError('the browser has taken the graphics card away for the moment');
   }
 
   readonly #onLost = (event: Event): void => {
@@ -294,7 +272,7 @@ export class Renderer {
     this.#device = new Device(this.gl, this.#options);
     this.#presentation = new Presentation(this.#device);
     this.#timer = new Timer(this.gl, this.isSoftware);
-    this.#last = this.#sharpening = null;
+    this.#shown = this.#job = null;
     this.#options.onRestored?.();
   };
 }
@@ -307,38 +285,23 @@ function contextOf(canvas: HTMLCanvasElement | OffscreenCanvas): WebGL2Rendering
   return gl;
 }
 
-/** Return how many rays go across a pixel: as many as it spans texels, as far as level and memory allow. */
-function raysAcrossOf(scene: SceneSource, camera: Camera, { raysAcross }: Quality): number {
-  if (scene.mapping !== null || raysAcross === 1) return 1; // texels differ where space is mapped
-  const most = Math.floor(Math.sqrt(Math.max(1, MOST_PIXELS / (camera.width * camera.height))));
-  return Math.max(1, Math.min(Math.floor(texelsPerPixel(scene, camera)), raysAcross, most));
+function viewOf(camera: Camera, moments: readonly Moment[], options: DrawOptions): View {
+  const { part = 'all', appearance = null, background = null } = options;
+  return { camera, moments, part, appearance, background };
 }
 
-/** Return the camera with the raster of rays that is marched. */
-function rasterOf(scene: SceneSource, camera: Camera, quality: Quality, scale: number): Camera {
-  const side = raysAcrossOf(scene, camera, quality) * quality.resolution * scale;
-  if (side === 1) return camera;
-  return resized(
-    camera,
-    ...([camera.width, camera.height].map((n) => Math.max(1, Math.round(n * side))) as [number, number]),
-  );
-}
-
-const versionOf = (moments: readonly Moment[]) => moments.map(({ scene }) => scene.version).join();
-
-/** What targets of still pictures are called, so that others do not take their place. */
-const roleOf = (rung: Rung) => (rung === STILL ? 'still ' : '');
-
-function isSameRequest(a: Request, b: Request): boolean {
-  const [x, y] = [a.options, b.options];
+/** Return whether two views show the same, but for planes that have arrived in between. */
+function isSame(a: View, b: View): boolean {
   return (
-    a.version === b.version &&
     isSameView(a.camera, b.camera) &&
     a.moments.length === b.moments.length &&
-    a.moments.every((moment, i) => moment.scene === b.moments[i].scene && moment.time === b.moments[i].time) &&
-    x.level === y.level &&
-    x.part === y.part &&
-    x.appearance === y.appearance &&
-    x.background === y.background
+    a.moments.every(({ scene, time }, i) => scene === b.moments[i].scene && time === b.moments[i].time) &&
+    a.part === b.part &&
+    a.appearance === b.appearance &&
+    a.background === b.background
   );
 }
+
+const rungOf = (level: Level | Rung): Rung => (typeof level === 'string' ? { level, scale: 1 } : level);
+
+const isSameRung = (a: Rung | undefined, b: Rung) => a?.level === b.level && a.scale === b.scale;

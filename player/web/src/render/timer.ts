@@ -17,6 +17,7 @@ export class Timer {
   #fence: WebGLSync | null = null;
   #query: WebGLQuery | null = null;
   #started = 0;
+  #done: (seconds: number) => void = () => {};
   #poll: ReturnType<typeof setTimeout> | undefined;
 
   constructor(
@@ -32,8 +33,10 @@ export class Timer {
     return this.#fence !== null;
   }
 
-  start(): void {
+  /** Begin with a piece of work; `done` gets its seconds once it is done, unless nothing can be said of it. */
+  start(done: (seconds: number) => void): void {
     const { gl } = this;
+    this.#done = done;
     this.#started = performance.now();
     if (this.#extension) {
       this.#query = gl.createQuery();
@@ -41,26 +44,26 @@ export class Timer {
     }
   }
 
-  /** End the work; `done` gets its seconds once it is done, unless nothing can be said of it. */
-  finish(done: (seconds: number) => void): void {
+  /** End the work. */
+  finish(): void {
     const { gl } = this;
     if (this.#extension && this.#query) gl.endQuery(this.#extension.TIME_ELAPSED_EXT);
     this.#fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
-    this.#look(done);
+    this.#look();
   }
 
-  #look(done: (seconds: number) => void): void {
+  #look(): void {
     this.#poll = setTimeout(() => {
       const { gl } = this;
       if (this.#fence === null) return;
       if (gl.getSyncParameter(this.#fence, gl.SYNC_STATUS) !== gl.SIGNALED && !gl.isContextLost()) {
-        this.#look(done);
+        this.#look();
         return;
       }
       const seconds = this.#seconds();
       this.#forget();
-      if (seconds > 0) done(seconds);
+      if (seconds > 0) this.#done(seconds);
     }, POLL_MS);
   }
 

@@ -1,0 +1,142 @@
+/** A picture in the making: its rays are marched in strips of rows, so that no single call takes long. */
+
+import { type Camera, resized, texelsPerPixel } from './camera.js';
+import type { Device } from './device.js';
+import type { DrawnScene, Shot } from './drawn_scene.js';
+import type { Rung } from './pace.js';
+import type { Presentation, Target } from './presentation.js';
+import { LEVELS, type Quality } from './quality.js';
+import type { SceneSource } from './scene_source.js';
+
+export type ShownPart = 'all' | 'static' | 'dynamic';
+
+/** A scene at a time in [0, 1] of its own, and its share of the picture: 1, or two groups' that make 1 together. */
+export interface Moment {
+  scene: DrawnScene;
+  time: number;
+  share: number;
+}
+
+/** What a picture shows. */
+export interface View {
+  camera: Camera;
+  moments: readonly Moment[];
+  part: ShownPart;
+  appearance: Float32Array | null;
+  background: ArrayLike<number> | null;
+}
+
+/** How a picture is kept: its role tells it from others of the same size. */
+export interface Keeping {
+  role: string;
+  isExact: boolean; // with float32 numbers and depths
+  isCounted: boolean; // with the number of cells that were looked up
+}
+
+/** A finished picture of a moment, at the camera's size or smaller, and the static part to subtract from it. */
+export interface Picture {
+  share: number;
+  target: Target;
+  still: Target | null;
+}
+
+/** Pixels of a raster with several rays a pixel, at most. */
+const MOST_PIXELS = 1 << 22;
+
+export class PictureJob {
+  readonly view: View;
+  readonly rung: Rung;
+  readonly role: string;
+  /** Seconds that the card has spent on it. */
+  seconds = 0;
+  readonly #shots: (Shot & { scene: DrawnScene; target: Target; raysAcross: number; share: number })[];
+  readonly #keeping: Keeping;
+  #nextRow = 0;
+
+  constructor(view: View, rung: Rung, presentation: Presentation, keeping: Keeping) {
+    this.view = view;
+    this.rung = rung;
+    this.role = keeping.role;
+    this.#keeping = keeping;
+    const quality = LEVELS[rung.level];
+    const parts = { all: [true], static: [false], dynamic: [true, false] }[view.part];
+    this.#shots = view.moments.flatMap(({ scene, time, share }, number) => {
+      const raysAcross = raysAcrossOf(scene.source, view.camera, quality);
+      const camera = rasterOf(view.camera, raysAcross * quality.resolution * rung.scale);
+      const { appearance } = view;
+      const background = view.background ?? scene.source.head.background;
+      return parts.map((isMoving) => {
+        const name = `${keeping.role} ${number} ${isMoving}`;
+        const target = presentation.target(name, camera.width, camera.height, keeping.isExact);
+        return { scene, camera, time, share, quality, isMoving, appearance, background, target, raysAcross };
+      });
+    });
+  }
+
+  /** Rays of a row of the picture, those of longer steps counting less. */
+  get raysPerRow(): number {
+    const { camera, quality } = this.#shots[0];
+    return camera.width / quality.step;
+  }
+
+  /** Rays for each pixel, those of longer steps counting less. */
+  get raysPerPixel(): number {
+    const { width, height } = this.view.camera;
+    return (this.raysPerRow * this.#shots[0].target.height) / (width * height);
+  }
+
+  get rowsLeft(): number {
+    return this.#shots.reduce((sum, { target }) => sum + target.height, 0) - this.#nextRow;
+  }
+
+  /** What is marched: for each moment the whole scene, its static part, or both. */
+  get targets(): Target[] {
+    return this.#shots.map(({ target }) => target);
+  }
+
+  /** March some rows. */
+  march(device: Device, rows: number): void {
+    let first = this.#nextRow;
+    let more = rows;
+    for (const shot of this.#shots) {
+      const count = Math.min(more, shot.target.height - first);
+      if (count > 0) {
+        shot.scene.march(device, shot.target, { ...shot, isCounted: this.#keeping.isCounted }, first, count);
+        more -= count;
+      }
+      first = Math.max(0, first - shot.target.height);
+    }
+    this.#nextRow += rows - more;
+  }
+
+  /** Return the pictures of the moments, once all rows are marched. */
+  finish(presentation: Presentation): Picture[] {
+    const { camera, moments } = this.view;
+    const targets = this.#shots.map(({ target, raysAcross, isMoving }, number) => {
+      if (raysAcross === 1) return target;
+      const name = `mean ${this.role} ${number} ${isMoving}`;
+      const mean = presentation.target(name, camera.width, camera.height, this.#keeping.isExact);
+      return presentation.average(target, mean, raysAcross);
+    });
+    const parts = targets.length / moments.length;
+    return moments.map(({ share }, number) => ({
+      share,
+      target: targets[number * parts],
+      still: parts === 2 ? targets[number * parts + 1] : null,
+    }));
+  }
+}
+
+/** Return how many rays go across a pixel: as many as it spans texels, as far as level and memory allow. */
+function raysAcrossOf(scene: SceneSource, camera: Camera, { raysAcross }: Quality): number {
+  if (scene.mapping !== null || raysAcross === 1) return 1; // texels differ where space is mapped
+  const most = Math.floor(Math.sqrt(Math.max(1, MOST_PIXELS / (camera.width * camera.height))));
+  return Math.max(1, Math.min(Math.floor(texelsPerPixel(scene, camera)), raysAcross, most));
+}
+
+/** Return the camera with the raster of rays that is marched. */
+function rasterOf(camera: Camera, factor: number): Camera {
+  if (factor === 1) return camera;
+  const [width, height] = [camera.width, camera.height].map((side) => Math.max(1, Math.round(side * factor)));
+  return resized(camera, width, height);
+}
