@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import IO
 
 import ffmpeg
-import imageio_ffmpeg
 import numpy as np
 
 from kpc.format.common.cli import atomic_write
@@ -241,7 +240,7 @@ def _list(codec: Codec) -> str:
 
 @functools.cache
 def ffmpeg_binary() -> str:
-    """Return the ffmpeg to run: the one on PATH, else the one that the package imageio-ffmpeg brings.
+    """Return the ffmpeg to run: the one on PATH, else the one that the package imageio-ffmpeg (extra `film`) brings.
 
     Raises:
         MediaError: there is none.
@@ -250,10 +249,12 @@ def ffmpeg_binary() -> str:
     if found:
         return found
     try:
+        import imageio_ffmpeg
+
         return str(imageio_ffmpeg.get_ffmpeg_exe())
-    except RuntimeError as error:
+    except (ModuleNotFoundError, RuntimeError) as error:
         raise MediaError(
-            "ffmpeg: no binary on PATH nor in imageio-ffmpeg; install ffmpeg (Debian: apt install ffmpeg)"
+            'ffmpeg: films need it, and PATH has none; install it (Debian: apt install ffmpeg) or pip install ".[film]"'
         ) from error
 
 

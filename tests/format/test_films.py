@@ -1,6 +1,8 @@
 """Films have the codec, bits, alpha and colour tags that are asked for, and all their frames."""
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -144,13 +146,24 @@ def test_failed_writing_leaves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_no_ffmpeg_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ffmpeg_is_that_of_the_path_or_the_wheel(monkeypatch: pytest.MonkeyPatch) -> None:
+    wheel = SimpleNamespace(get_ffmpeg_exe=lambda: "/wheel/ffmpeg")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", wheel)
+    monkeypatch.setattr(films.shutil, "which", lambda name: f"/path/{name}")
+    assert ffmpeg_binary.__wrapped__() == "/path/ffmpeg"
+    monkeypatch.setattr(films.shutil, "which", lambda name: None)
+    assert ffmpeg_binary.__wrapped__() == "/wheel/ffmpeg"
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_no_ffmpeg_anywhere(monkeypatch: pytest.MonkeyPatch, is_there: bool) -> None:
+    """The wheel may be missing, or have no binary for this system."""
+
     def none() -> str:
         raise RuntimeError("none")
 
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", SimpleNamespace(get_ffmpeg_exe=none) if is_there else None)
     monkeypatch.setattr(films.shutil, "which", lambda name: None)
-    monkeypatch.setattr(films.imageio_ffmpeg, "get_ffmpeg_exe", none)
-    ffmpeg_binary.cache_clear()
-    with pytest.raises(MediaError, match="install ffmpeg"):
-        ffmpeg_binary()
-    ffmpeg_binary.cache_clear()
+    with pytest.raises(MediaError, match=r'apt install ffmpeg\) or pip install "\.\[film\]"') as refused:
+        ffmpeg_binary.__wrapped__()
+    assert "\n" not in str(refused.value)
