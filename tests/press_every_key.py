@@ -40,7 +40,7 @@ def main(scene_file: str) -> None:
     opening_asks_for_older_opengl()
     window = Window("test", (320, 240))
     stream = GroupPlayback(open_source(scene_file))
-    player = Player(window, stream, Preferences(text_size=0.9))
+    player = Player(window, stream, Preferences(text_size=0.8))
     while not stream.is_settled:
         player.frame()
 
@@ -195,9 +195,9 @@ def keys_of_quality_and_panels(player: Player) -> None:
     with replaced(imgui, button=lambda label, *_: label == "open"):
         player.frame()
     player.frame()
-    assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
+    assert imgui.is_popup_open("", imgui.PopupFlags.ANY_POPUP)
     press(player, glfw.KEY_ESCAPE)
-    assert not imgui.is_popup_open("", imgui.PopupFlags_.any_popup) and not player.state.should_close
+    assert not imgui.is_popup_open("", imgui.PopupFlags.ANY_POPUP) and not player.state.should_close
     player.state.quality.choose(level)  # the level that U chose depends on the machine
     text_size = player.state.text_size
     player.press(glfw.KEY_EQUAL, glfw.MOD_CONTROL)
@@ -292,7 +292,7 @@ def every_pixel_is_used(player: Player) -> None:
     build = player.panels.build
 
     def measuring(asks: bool) -> None:
-        text_heights.append(imgui.get_font_size() * io.display_framebuffer_scale.x)
+        text_heights.append(imgui.get_font_size() * io.display_framebuffer_scale[0])
         build(asks)
 
     for units, pixels, scale in (
@@ -305,8 +305,8 @@ def every_pixel_is_used(player: Player) -> None:
                 player.frame()
             assert player.snapshot().canvas == pixels
             shown = (
-                io.display_size.x * io.display_framebuffer_scale.x,
-                io.display_size.y * io.display_framebuffer_scale.y,
+                io.display_size[0] * io.display_framebuffer_scale[0],
+                io.display_size[1] * io.display_framebuffer_scale[1],
             )
             assert shown == pixels
             before = player.snapshot().view
@@ -377,7 +377,7 @@ def drawing_fails(player: Player) -> None:
         state.look_from(state.view.orbit(0.1, 0.0))
         with raises(DisplayError, match="no memory"):
             player.frame()
-        imgui.end_frame()
+        player.imgui.end()
     player.forget_failures()
     state.quality.choose(level)
     player.frame()

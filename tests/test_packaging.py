@@ -76,7 +76,7 @@ sys.meta_path.insert(0, Nowhere())
 
 
 WITHOUT_TORCH = without("torch")
-WITHOUT_NUMBA = without("numba", "llvmlite")
+WITHOUT_NUMBA = without("numba", "llvmlite", "zstandard", "imageio_ffmpeg")
 
 
 VIEWERS = (
@@ -109,6 +109,16 @@ def test_reading_needs_no_numba(tmp_path: Path) -> None:
     assert run_without_numba("tools.cli.kprender", sample, *picture).returncode == 0
     titled = run_without_numba("tools.cli.kpedit", sample, "-o", str(tmp_path / "a.kpc"), "--title", "A corner")
     assert titled.returncode == 0 and (tmp_path / "a.kpc").stat().st_size > 1000
+
+
+def test_exr_pictures_without_their_package_are_one_line(tmp_path: Path) -> None:
+    program = f"{without('OpenEXR')}\nimport kpc.tools.cli.kprender as c; sys.exit(c.main(sys.argv[1:]))"
+    options = [str(ROOT / "samples" / "default.kpc"), "--backend", "reference", "--time", "0", "--size", "8x6", "-o"]
+    for suffix, code, lines in ((".png", 0, 1), (".exr", 1, 2)):  # the first names the renderer
+        command = [sys.executable, "-c", program, *options, str(tmp_path / f"a{suffix}")]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == code and done.stderr.count("\n") == lines, done.stderr
+    assert 'needs OpenEXR, which is not installed; in a checkout of KPC, pip install ".[film]"' in done.stderr
 
 
 def test_writing_without_numba_is_one_line(tmp_path: Path) -> None:

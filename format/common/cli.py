@@ -21,7 +21,7 @@ from kpc.format.common.text import valid_unicode
 from kpc.format.common.version import VERSION
 
 # Packages that only some extras bring, with one that does.
-EXTRAS = {"numba": "cpu", "llvmlite": "cpu"}
+EXTRAS = {"numba": "cpu", "llvmlite": "cpu", "OpenEXR": "film"}
 
 
 def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None = None) -> int:

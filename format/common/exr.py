@@ -1,14 +1,16 @@
-"""Reading of OpenEXR images, as linear light."""
+"""Reading of OpenEXR images, as linear light, by the package OpenEXR, which the extras `encoder` and `film` bring."""
 
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import OpenEXR
 
 from kpc.format.common.errors import MediaError
+
+if TYPE_CHECKING:
+    import OpenEXR
 
 # The first bytes of every OpenEXR file.
 _MAGIC = bytes.fromhex("762f3101")
@@ -73,8 +75,10 @@ def read_exr(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 @contextmanager
-def _opened(path: str | os.PathLike[str], **options: bool) -> Iterator[OpenEXR.File]:
+def _opened(path: str | os.PathLike[str], **options: bool) -> "Iterator[OpenEXR.File]":
     """Open a file; the name is given as bytes, since OpenEXR takes no str that is not valid Unicode."""
+    import OpenEXR
+
     with OpenEXR.File(os.fsencode(path), **options) as exr:
         yield exr
 
@@ -93,8 +97,10 @@ def _size(path: str | os.PathLike[str], header: dict[str, Any]) -> tuple[int, in
     return sizes[0]
 
 
-def _colour_channels(path: str | os.PathLike[str], exr: OpenEXR.File) -> tuple[int, tuple[str, ...]]:
+def _colour_channels(path: str | os.PathLike[str], exr: "OpenEXR.File") -> tuple[int, tuple[str, ...]]:
     """Return the part and the names of the channels to read: red, green and blue, or luminance thrice; then alpha."""
+    import OpenEXR
+
     found: dict[str, tuple[int, tuple[str, ...]]] = {}
     everything: list[str] = []
     for part in range(len(exr.parts)):

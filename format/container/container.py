@@ -7,6 +7,7 @@ entry. This module does not know what a scene is: a chunk is a kind, a position 
 """
 
 import struct
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -14,10 +15,14 @@ from enum import IntEnum
 
 import google_crc32c
 import numpy as np
-import zstandard
 
 from kpc.format.common.errors import FormatError
 from kpc.format.container.sources import AnySource, RemoteSource, Source, open_source
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 MAGIC = b"\x89KPC\r\n\x1a\n"
 VERSION = 1
@@ -26,6 +31,8 @@ ENTRY = struct.Struct("<4sHBBIIHIII")  # see `Entry`; the offset is not stored
 VERSION_STRUCT = struct.Struct("<8sHH")  # magic, version, header_length: their positions never change
 
 ZSTD_LEVEL = 19
+# Frames of any window are read: what they take is bounded by the size of their content.
+ZSTD_OPTIONS = {zstd.DecompressionParameter.window_log_max: zstd.DecompressionParameter.window_log_max.bounds()[1]}
 ZSTD_BLOCK = 1 << 17  # bytes of a block of a zstd frame, at most (RFC 8878)
 
 # Bytes of file for each chunk, at least, so that a small file cannot claim many chunks.
@@ -197,11 +204,9 @@ def _zstd_frames(raw: bytes) -> list[bytes]:
     """Return two zstd frames of the same bytes; in noise, short matches cost more than they save, hence one with long
     ones only.
     """
-    long_matches = zstandard.ZstdCompressionParameters.from_level(ZSTD_LEVEL, source_size=len(raw), min_match=7)
-    return [
-        zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(raw),
-        zstandard.ZstdCompressor(compression_params=long_matches).compress(raw),
-    ]
+    parameter = zstd.CompressionParameter
+    long_matches = {parameter.compression_level: ZSTD_LEVEL, parameter.min_match: 7}
+    return [zstd.compress(raw, level=ZSTD_LEVEL), zstd.compress(raw, options=long_matches)]
 
 
 def header_and_index(entries: Sequence[Entry], value_count: int, *, compress: bool = True) -> bytes:
@@ -213,7 +218,7 @@ def header_and_index(entries: Sequence[Entry], value_count: int, *, compress: bo
     table, stored = transposed_entries(entries), sum(entry.stored_length for entry in entries)
     index = stored_frame(table)
     if compress:
-        compressed = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(table)
+        compressed = zstd.compress(table, level=ZSTD_LEVEL)
         if len(compressed) + stored >= MIN_CHUNK_BYTES * len(entries):
             index = min(compressed, index, key=len)
     fields = HEADER.pack(
@@ -441,9 +446,13 @@ class Reader:
     def _decompressed(self, body: bytes, length: int, what: str) -> bytes:
         """Return the content of exactly one zstd frame, which must be `length` bytes."""
         try:
-            frame = zstandard.get_frame_parameters(body)
-            if frame.content_size != length or frame.dict_id:
+            frame = zstd.get_frame_info(body)
+            if frame.decompressed_size != length or frame.dictionary_id:
                 raise FormatError(f"{self.name}: {what}: its zstd frame claims another length")
-            return zstandard.ZstdDecompressor().decompress(body, max_output_size=length, allow_extra_data=False)
-        except zstandard.ZstdError as error:
+            decoder = zstd.ZstdDecompressor(options=ZSTD_OPTIONS)
+            content = decoder.decompress(body, max_length=length + 1)
+        except zstd.ZstdError as error:
             raise FormatError(f"{self.name}: {what} is no valid zstd frame ({error})") from error
+        if len(content) != length or not decoder.eof or decoder.unused_data:
+            raise FormatError(f"{self.name}: {what} is no valid zstd frame (cut off, or followed by more)")
+        return content

@@ -1,10 +1,7 @@
-"""The only place where glfw and imgui are imported, in the order and with the library that the desktop needs.
+"""The only place where glfw and imgui are imported, with the library that the desktop needs.
 
-On Linux, glfw has one library for X11 and one for Wayland, and imgui-bundle has a glfw library of its own for X11. If
-imgui-bundle is imported first, glfw uses its library. If glfw is imported first, imgui-bundle uses glfw's, and fails to
-load if that is the one for Wayland, which lacks the functions for X11. So glfw is imported second, after PYGLFW_LIBRARY
-was set to its library for Wayland where there is no X server. PYGLFW_LIBRARY_VARIANT=wayland asks for that library
-anywhere.
+On Linux, glfw has one library for X11 and one for Wayland. PYGLFW_LIBRARY is set to that for Wayland where there is no
+X server; PYGLFW_LIBRARY_VARIANT=wayland asks for it anywhere.
 """
 
 import importlib.util
@@ -31,9 +28,7 @@ def wayland_library(platform: str, environment: Mapping[str, str]) -> Path | Non
 if library := wayland_library(sys.platform, os.environ):
     os.environ.setdefault("PYGLFW_LIBRARY", str(library))
 
-# isort: off
-from imgui_bundle import hello_imgui, imgui, portable_file_dialogs  # noqa: E402
 import glfw  # noqa: E402
-# isort: on
+from slimgui import imgui  # noqa: E402
 
-__all__ = ["glfw", "hello_imgui", "imgui", "portable_file_dialogs"]
+__all__ = ["glfw", "imgui"]

@@ -3,11 +3,13 @@
 import ctypes
 
 import moderngl
-import numpy as np
 
 from kpc.player.app.desktop import imgui
 from kpc.player.app.widgets import ACCENT
 from kpc.player.gl import shader
+
+# Height of the text, and a scale at which ImGui's default font is its vector font instead of the bitmap font.
+FONT_SIZE, VECTOR_FONT_SCALE = 15.0, 2.0
 
 _VERTEX = f"""{shader.Language.DESKTOP.value}
 uniform vec2 display;
@@ -46,13 +48,14 @@ class ImGuiRenderer:
         self._context = imgui.create_context()
         imgui.set_current_context(self._context)  # there may be another one
         self.io = imgui.get_io()
-        self.io.set_ini_filename("")  # write no files
-        self.io.backend_flags |= imgui.BackendFlags_.renderer_has_textures
+        self.io.ini_filename = None  # write no files
+        self.io.backend_flags |= imgui.BackendFlags.RENDERER_HAS_TEXTURES
         max_side = ctx.info["GL_MAX_TEXTURE_SIZE"]
         imgui.get_platform_io().renderer_texture_max_width = max_side
         imgui.get_platform_io().renderer_texture_max_height = max_side
-        self.io.fonts.add_font_default_vector()
         _style()
+        imgui.get_style().font_scale_main = VECTOR_FONT_SCALE  # which default font is added depends on it
+        self._font = self.io.fonts.add_font_default()
         self._program = ctx.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
         self._vertices = ctx.buffer(reserve=1 << 16, dynamic=True)
         self._indices = ctx.buffer(reserve=1 << 16, dynamic=True)
@@ -73,14 +76,16 @@ class ImGuiRenderer:
         """
         self._pixels = framebuffer
         ratio = framebuffer[0] / max(window[0], 1), framebuffer[1] / max(window[1], 1)
-        self.io.display_size = imgui.ImVec2(*window)
-        self.io.display_framebuffer_scale = imgui.ImVec2(*ratio)
+        self.io.display_size = window
+        self.io.display_framebuffer_scale = ratio
         self.io.delta_time = max(seconds, 1e-4)
-        imgui.get_style().font_scale_dpi = max(content_scale / max(ratio[0], 1e-6), 0.5)
+        imgui.get_style().font_scale_main = max(content_scale / max(ratio[0], 1e-6), 0.5)
         imgui.new_frame()
+        imgui.push_font(self._font, FONT_SIZE)
 
     def draw(self, framebuffer: moderngl.Framebuffer) -> None:
         """Draw the widgets built since `begin` over what the framebuffer holds."""
+        imgui.pop_font()
         imgui.render()
         data = imgui.get_draw_data()
         self._update_textures()
@@ -89,16 +94,16 @@ class ImGuiRenderer:
         framebuffer.viewport = (0, 0, width, height)
         display = self._program["display"]
         assert isinstance(display, moderngl.Uniform)  # for the type checker: the shader above declares it
-        display.value = (data.display_size.x, data.display_size.y)
+        display.value = self.io.display_size
         self.ctx.enable_only(moderngl.BLEND)
         self.ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
-        scale = data.framebuffer_scale
-        for commands in data.cmd_lists:
+        across, down = data.framebuffer_scale
+        for commands in data.commands_lists:
             self._upload(commands)
-            for command in commands.cmd_buffer:
+            for command in commands.commands:
                 left, top, right, bottom = command.clip_rect
-                x, y = int(left * scale.x), int(height - bottom * scale.y)
-                w, h = int((right - left) * scale.x), int((bottom - top) * scale.y)
+                x, y = int(left * across), int(height - bottom * down)
+                w, h = int((right - left) * across), int((bottom - top) * down)
                 if w <= 0 or h <= 0:
                     continue
                 framebuffer.scissor = (max(x, 0), max(y, 0), w, h)
@@ -109,10 +114,11 @@ class ImGuiRenderer:
 
     def end(self) -> None:
         """End a frame that is not drawn."""
+        imgui.pop_font()
         imgui.end_frame()
 
     def make_texture(self, size: tuple[int, int]) -> moderngl.Texture:
-        """Return an RGB texture of (width, height) that widgets can show as `imgui.ImTextureRef(texture.glo)`."""
+        """Return an RGB texture of (width, height) that widgets can show as `texture.glo`."""
         texture = self.ctx.texture(size, 3, alignment=1)
         self._textures[texture.glo] = texture
         return texture
@@ -126,8 +132,8 @@ class ImGuiRenderer:
         imgui.set_current_context(self._context)
         for texture in imgui.get_platform_io().textures:
             texture.set_tex_id(0)
-            texture.status = imgui.ImTextureStatus.destroyed
-        self.io.backend_flags &= ~imgui.BackendFlags_.renderer_has_textures
+            texture.set_status(imgui.TextureStatus.DESTROYED)
+        self.io.backend_flags &= ~imgui.BackendFlags.RENDERER_HAS_TEXTURES
         imgui.destroy_context(self._context)
 
     def _bind(self) -> moderngl.VertexArray:
@@ -136,37 +142,33 @@ class ImGuiRenderer:
             self._program, layout, index_buffer=self._indices, index_element_size=imgui.INDEX_SIZE
         )
 
-    def _upload(self, commands: imgui.ImDrawList) -> None:
-        vertices, indices = commands.vtx_buffer, commands.idx_buffer
-        vertex_bytes, index_bytes = vertices.size() * imgui.VERTEX_SIZE, indices.size() * imgui.INDEX_SIZE
+    def _upload(self, commands: imgui.DrawList) -> None:
+        vertex_bytes = commands.vtx_buffer_size * imgui.VERTEX_SIZE
+        index_bytes = commands.idx_buffer_size * imgui.INDEX_SIZE
         if vertex_bytes > self._vertices.size or index_bytes > self._indices.size:
             self._array.release()
             self._vertices.orphan(max(2 * vertex_bytes, self._vertices.size))
             self._indices.orphan(max(2 * index_bytes, self._indices.size))
             self._array = self._bind()
-        self._vertices.write(ctypes.string_at(vertices.data_address(), vertex_bytes))
-        self._indices.write(ctypes.string_at(indices.data_address(), index_bytes))
+        self._vertices.write(ctypes.string_at(commands.vtx_buffer_data, vertex_bytes))
+        self._indices.write(ctypes.string_at(commands.idx_buffer_data, index_bytes))
 
     def _update_textures(self) -> None:
         """Update the textures of glyphs, which ImGui rasterises when they are first used."""
-        status = imgui.ImTextureStatus
+        status = imgui.TextureStatus
         for wanted in imgui.get_platform_io().textures:
-            if wanted.status == status.want_create:
-                texture = self.ctx.texture((wanted.width, wanted.height), 4, _texels(wanted).tobytes())
+            if wanted.status == status.WANT_CREATE:
+                texture = self.ctx.texture((wanted.width, wanted.height), 4, wanted.get_pixels().tobytes())
                 self._textures[texture.glo] = texture
                 wanted.set_tex_id(texture.glo)
-                wanted.status = status.ok
-            elif wanted.status == status.want_updates:
-                self._textures[wanted.tex_id].write(_texels(wanted).tobytes())
-                wanted.status = status.ok
-            elif wanted.status == status.want_destroy and wanted.unused_frames > 0:
-                self._textures.pop(wanted.tex_id).release()
+                wanted.set_status(status.OK)
+            elif wanted.status == status.WANT_UPDATES:
+                self._textures[wanted.get_tex_id()].write(wanted.get_pixels().tobytes())
+                wanted.set_status(status.OK)
+            elif wanted.status == status.WANT_DESTROY and wanted.unused_frames > 0:
+                self._textures.pop(wanted.get_tex_id()).release()
                 wanted.set_tex_id(0)
-                wanted.status = status.destroyed
-
-
-def _texels(texture: imgui.ImTextureData) -> np.ndarray:
-    return np.asarray(texture.get_pixels_array())
+                wanted.set_status(status.DESTROYED)
 
 
 def _style() -> None:
@@ -175,19 +177,19 @@ def _style() -> None:
     style = imgui.get_style()
     style.window_rounding = style.frame_rounding = style.grab_rounding = 5.0
     style.window_border_size = 0.0
-    style.window_padding = imgui.ImVec2(10, 8)
-    style.item_spacing = imgui.ImVec2(8, 5)
-    style.font_size_base = 15.0
-    style.set_color_(imgui.Col_.window_bg, imgui.ImVec4(0.06, 0.07, 0.09, 0.72))
-    style.set_color_(imgui.Col_.text_disabled, imgui.ImVec4(0.74, 0.76, 0.80, 1.0))
-    style.cell_padding = imgui.ImVec2(8, 2)
-    style.set_color_(imgui.Col_.frame_bg, imgui.ImVec4(1.0, 1.0, 1.0, 0.10))
-    style.set_color_(imgui.Col_.frame_bg_hovered, imgui.ImVec4(1.0, 1.0, 1.0, 0.16))
-    style.set_color_(imgui.Col_.frame_bg_active, imgui.ImVec4(1.0, 1.0, 1.0, 0.20))
-    style.set_color_(imgui.Col_.button, imgui.ImVec4(1.0, 1.0, 1.0, 0.10))
-    style.set_color_(imgui.Col_.button_hovered, imgui.ImVec4(1.0, 1.0, 1.0, 0.22))
-    style.set_color_(imgui.Col_.button_active, ACCENT)
-    style.set_color_(imgui.Col_.check_mark, ACCENT)
+    style.window_padding = (10, 8)
+    style.item_spacing = (8, 5)
+    style.colors[imgui.Col.WINDOW_BG] = (0.06, 0.07, 0.09, 0.72)
+    style.colors[imgui.Col.TEXT_DISABLED] = (0.74, 0.76, 0.80, 1.0)
+    style.cell_padding = (8, 2)
+    style.colors[imgui.Col.FRAME_BG] = (1.0, 1.0, 1.0, 0.10)
+    style.colors[imgui.Col.FRAME_BG_HOVERED] = (1.0, 1.0, 1.0, 0.16)
+    style.colors[imgui.Col.FRAME_BG_ACTIVE] = (1.0, 1.0, 1.0, 0.20)
+    style.colors[imgui.Col.BUTTON] = (1.0, 1.0, 1.0, 0.10)
+    style.colors[imgui.Col.BUTTON_HOVERED] = (1.0, 1.0, 1.0, 0.22)
+    style.colors[imgui.Col.BUTTON_ACTIVE] = ACCENT
+    style.colors[imgui.Col.CHECK_MARK] = ACCENT
+    style.colors[imgui.Col.CHECKBOX_SELECTED_BG] = style.colors[imgui.Col.FRAME_BG]
     # The text of a slider lies over its grab.
-    style.set_color_(imgui.Col_.slider_grab, imgui.ImVec4(ACCENT.x, ACCENT.y, ACCENT.z, 0.40))
-    style.set_color_(imgui.Col_.slider_grab_active, imgui.ImVec4(ACCENT.x, ACCENT.y, ACCENT.z, 0.55))
+    style.colors[imgui.Col.SLIDER_GRAB] = (*ACCENT[:3], 0.40)
+    style.colors[imgui.Col.SLIDER_GRAB_ACTIVE] = (*ACCENT[:3], 0.55)

@@ -14,6 +14,8 @@ from kpc.player.app.window import Window
 # Seconds in which the flying camera crosses the longest edge of the scene's bounding box, and how much faster it is
 # with Shift.
 CROSSING_S, SHIFT_FACTOR = 4.0, 4.0
+# Buttons of the mouse that move the camera.
+BUTTONS = imgui.MouseButton.LEFT, imgui.MouseButton.RIGHT, imgui.MouseButton.MIDDLE
 # The camera flies no farther than in so many seconds at once, however long a frame took.
 MAX_FLY_S = 0.1
 
@@ -176,10 +178,10 @@ class Input:
         if io.want_capture_mouse:
             return
         height = max(self.window.size[1], 1)
-        right, down = io.mouse_delta.x / height, io.mouse_delta.y / height
+        right, down = (side / height for side in io.mouse_delta)
         shift = self.window.is_held(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SHIFT)
         # In the frame of the press, the motion is that before it.
-        held = [imgui.is_mouse_down(button) and not imgui.is_mouse_clicked(button) for button in range(3)]
+        held = [imgui.is_mouse_down(button) and not imgui.is_mouse_clicked(button) for button in BUTTONS]
         if (right or down) and (held[1] or held[2] or (shift and held[0])):
             state.move_to(state.view.pan(right, -down))
         elif (right or down) and held[0]:

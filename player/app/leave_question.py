@@ -11,7 +11,7 @@ def ask(actions: Actions) -> None:
     place_next(width / 2, height / 2, 0.5, 0.5)
     imgui.set_next_window_bg_alpha(0.95)
     imgui.set_next_window_focus()
-    with panel("leave"):
+    with panel("leave", is_above=True):
         imgui.text("The camera path is not saved.")
         if imgui.button("save it"):
             actions.save_path()

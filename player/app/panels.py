@@ -115,7 +115,7 @@ class Panels:
             visible.path = toggle("path", visible.path)
             imgui.same_line()
             visible.keys = toggle("keys", visible.keys)
-            return imgui.get_window_pos().x + imgui.get_window_width()
+            return imgui.get_window_pos()[0] + imgui.get_window_width()
 
     def _statistics(self) -> None:
         """Frame rate, resolution, samples, memory, device, what has arrived."""
@@ -141,7 +141,7 @@ class Panels:
         label("quality")
         number = LEVEL_NAMES.index(quality.level)
         changed, wanted = imgui.slider_int(
-            "##quality", number, 0, len(LEVEL_NAMES) - 1, quality.level, imgui.SliderFlags_.no_input
+            "##quality", number, 0, len(LEVEL_NAMES) - 1, quality.level, imgui.SliderFlags.NO_INPUT
         )
         if changed and wanted != number:
             quality.choose(LEVEL_NAMES[wanted])
@@ -152,7 +152,7 @@ class Panels:
         imgui.set_item_tooltip("Lower and raise the quality so that so many frames come each second (U)")
         imgui.same_line()
         imgui.set_next_item_width((CONTROL_EM - 2) * imgui.get_font_size())
-        flags = imgui.SliderFlags_.no_input | imgui.SliderFlags_.logarithmic
+        flags = imgui.SliderFlags.NO_INPUT | imgui.SliderFlags.LOGARITHMIC
         moved, fps = imgui.slider_float("##fps", state.target_fps, *SLIDER_FPS, "%.0f fps", flags)
         if moved:
             state.target_fps = min(max(fps, TARGET_FPS[0]), TARGET_FPS[1])
@@ -183,13 +183,13 @@ class Panels:
             return bottom
         place_bar(bottom)
         with panel("transport", fits_content=False):
-            if imgui.button("pause" if playback.playing else "play", imgui.ImVec2(em(4), 0)):
+            if imgui.button("pause" if playback.playing else "play", (em(4), 0)):
                 self.state.follower.is_active = False
                 playback.toggle()
             imgui.same_line()
-            imgui.set_next_item_width(max(imgui.get_content_region_avail().x - em(13.5), em(4)))
+            imgui.set_next_item_width(max(imgui.get_content_region_avail()[0] - em(13.5), em(4)))
             text = f"{playback.time * duration_s:.2f} / {duration_s:.2f} s"
-            changed, time = imgui.slider_float("##time", playback.time, 0.0, 1.0, text, imgui.SliderFlags_.no_input)
+            changed, time = imgui.slider_float("##time", playback.time, 0.0, 1.0, text, imgui.SliderFlags.NO_INPUT)
             if changed:
                 self.state.scrub(time)
             imgui.same_line()
@@ -207,7 +207,7 @@ class Panels:
         size = statistics.history.shape[1]
         count = min(statistics.frames, size)
         place_next(window_size()[0] - em(MARGIN_EM), top, 1.0, 0.0)
-        imgui.set_next_window_size(imgui.ImVec2(em(PANEL_EM), 0))
+        imgui.set_next_window_size((em(PANEL_EM), 0))
         with panel("graphs", fits_content=False):
             rows = (("frame", None), ("picture", self.state.quality.target_s))
             for (name, target_s), values in zip(rows, statistics.history, strict=True):
@@ -217,13 +217,13 @@ class Panels:
                 highest = 1.25 * float(max(slow, 1.0, 1e3 * (target_s or 0.0)))
                 corner, extent = (
                     imgui.get_cursor_screen_pos(),
-                    imgui.ImVec2(imgui.get_content_region_avail().x, em(3.2)),
+                    (imgui.get_content_region_avail()[0], em(3.2)),
                 )
                 oldest = statistics.frames % size if count == size else 0
-                imgui.plot_lines(f"##{name}", shown, oldest, None, 0.0, highest, extent)
+                imgui.plot_lines(f"##{name}", np.roll(shown, -oldest), None, 0.0, highest, extent)
                 if target_s is not None:
-                    y = corner.y + extent.y * (1 - 1e3 * target_s / highest)
-                    ends = imgui.ImVec2(corner.x, y), imgui.ImVec2(corner.x + extent.x, y)
+                    y = corner[1] + extent[1] * (1 - 1e3 * target_s / highest)
+                    ends = (corner[0], y), (corner[0] + extent[0], y)
                     imgui.get_window_draw_list().add_line(*ends, imgui.get_color_u32(ACCENT))
             return top + imgui.get_window_height() + em(SPACING_EM)
 
@@ -252,7 +252,7 @@ class Panels:
                 filming.stop()
             imgui.set_item_tooltip("End the video here; what was recorded is kept (O)")
             if filming.is_along_path:
-                imgui.progress_bar(recording.taken / filming.path_frames, imgui.ImVec2(-1, em(0.4)), "")
+                imgui.progress_bar(recording.taken / filming.path_frames, (-1, em(0.4)), "")
             return top
 
     def _keys(self) -> None:
@@ -260,8 +260,8 @@ class Panels:
         width, height = window_size()
         place_next(width / 2, height / 2, 0.5, 0.5, max_height=0.94 * height)
         imgui.set_next_window_bg_alpha(0.95)
-        with panel("keys", scrolls=True):
-            if imgui.begin_table("keys", 2, imgui.TableFlags_.sizing_fixed_fit):
+        with panel("keys", scrolls=True, is_above=True):
+            if imgui.begin_table("keys", 2, imgui.TableFlags.SIZING_FIXED_FIT):
                 for binding in KEY_BINDINGS:
                     imgui.table_next_row()
                     imgui.table_next_column()

@@ -48,7 +48,7 @@ class PathPanel:
             self._slider()
             row = imgui.get_frame_height_with_spacing()
             count = len(follower.path.keyframes)
-            if imgui.begin_child("##keyframes", imgui.ImVec2(0, row * min(count, VISIBLE_KEYFRAMES))):
+            if imgui.begin_child("##keyframes", (0, row * min(count, VISIBLE_KEYFRAMES))):
                 for number in range(count):
                     imgui.push_id(number)
                     self._keyframe(number)
@@ -66,7 +66,7 @@ class PathPanel:
             path.start_s,
             end_s,
             "%.1f s",
-            imgui.SliderFlags_.no_input,
+            imgui.SliderFlags.NO_INPUT,
         )
         if changed:
             self.actions.to_path_position(position_s)
@@ -77,7 +77,7 @@ class PathPanel:
         if number >= len(follower.path.keyframes):
             return  # a keyframe before it has just been removed
         keyframe = follower.path.keyframes[number]
-        if imgui.button(f"{number + 1}", imgui.ImVec2(em(2), 0)):
+        if imgui.button(f"{number + 1}", (em(2), 0)):
             self.actions.to_path_position(float(keyframe.at_s or 0.0))
         imgui.set_item_tooltip("Go to this keyframe")
         imgui.same_line()
@@ -85,17 +85,17 @@ class PathPanel:
         if number:
             gap_s = float(keyframe.at_s or 0.0) - float(follower.path.keyframes[number - 1].at_s or 0.0)
             changed, gap_s = imgui.drag_float(
-                "##gap", gap_s, 0.05, MIN_GAP_S, MAX_GAP_S, "+%.1f s", imgui.SliderFlags_.no_input
+                "##gap", gap_s, 0.05, MIN_GAP_S, MAX_GAP_S, "+%.1f s", imgui.SliderFlags.NO_INPUT
             )
             if changed:
                 with contextlib.suppress(DatasetError):  # the path would be too long
                     follower.path = follower.path.spaced(number, max(gap_s, MIN_GAP_S))
             imgui.set_item_tooltip("Seconds since the keyframe before; drag to change")
         else:
-            imgui.dummy(imgui.ImVec2(em(5), 0))
+            imgui.dummy((em(5), 0))
         imgui.same_line()
         imgui.text_disabled(f"t {keyframe.time:.2f}")
         imgui.same_line()
-        if imgui.button("x", imgui.ImVec2(em(1.8), 0)):
+        if imgui.button("x", (em(1.8), 0)):
             follower.remove(number)
         imgui.set_item_tooltip("Remove this keyframe")

@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import platformdirs
+
 from kpc.format.common.cli import atomic_write
 from kpc.player.app.playlist import MAX_RECENT
 from kpc.player.quality import LEVELS
@@ -79,10 +81,7 @@ _IS_VALID: dict[str, Callable[[Any], bool]] = {
 
 def preferences_path() -> Path:
     """Return the path of the file, in $XDG_CONFIG_HOME or ~/.config, ~/Library/Application Support, or %APPDATA%."""
-    from kpc.player.app.desktop import hello_imgui
-
-    folder = hello_imgui.ini_folder_location(hello_imgui.IniFolderType.app_user_config_folder)
-    return Path(folder) / "kpc" / "player.json"
+    return platformdirs.user_config_path(roaming=True) / "kpc" / "player.json"
 
 
 def load(path: Path) -> Preferences:

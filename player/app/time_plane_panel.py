@@ -49,16 +49,16 @@ class TimePlanePanel:
             extent = f"{1 - self._high:.0%} to {1 - self._low:.0%} of {axis}"
             imgui.text_disabled(f"time to the right, {extent} upwards")
             imgui.set_item_tooltip("What moves is a wave; what is static is grey")
-            size = imgui.ImVec2(imgui.get_content_region_avail().x, min(em(7), 0.25 * window_size()[1]))
+            size = (imgui.get_content_region_avail()[0], min(em(7), 0.25 * window_size()[1]))
             corner = imgui.get_cursor_screen_pos()
-            lower, upper = imgui.ImVec2(0.0, self._low), imgui.ImVec2(1.0, self._high)
-            imgui.image(imgui.ImTextureRef(texture.glo), size, lower, upper)
+            lower, upper = (0.0, self._low), (1.0, self._high)
+            imgui.image(texture.glo, size, lower, upper)
             imgui.set_cursor_screen_pos(corner)
             imgui.invisible_button("##seek", size)
             if imgui.is_item_active():
-                state.scrub(state.stream.time_of((imgui.get_mouse_pos().x - corner.x) / max(size.x, 1.0)))
-            x = corner.x + state.stream.time_in(state.playback.time) * size.x
-            ends = imgui.ImVec2(x, corner.y), imgui.ImVec2(x, corner.y + size.y)
+                state.scrub(state.stream.time_of((imgui.get_mouse_pos()[0] - corner[0]) / max(size[0], 1.0)))
+            x = corner[0] + state.stream.time_in(state.playback.time) * size[0]
+            ends = (x, corner[1]), (x, corner[1] + size[1])
             imgui.get_window_draw_list().add_line(*ends, imgui.get_color_u32(ACCENT), max(em(0.12), 1.0))
             return bottom - imgui.get_window_height()
 

@@ -2,13 +2,15 @@
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 from kpc.format.common.text import valid_unicode
 from kpc.player.app.desktop import imgui
 
-# Colours of what is active, and of errors.
-ACCENT, ERROR = imgui.ImVec4(0.95, 0.62, 0.25, 1.0), imgui.ImVec4(1.0, 0.45, 0.38, 1.0)
+# Red, green, blue and alpha; those of what is active, and of errors.
+Colour: TypeAlias = tuple[float, float, float, float]
+ACCENT: Colour = (0.95, 0.62, 0.25, 1.0)
+ERROR: Colour = (1.0, 0.45, 0.38, 1.0)
 # Widths of the labels before controls, of the controls, and of the panels on the right, em.
 LABEL_EM, CONTROL_EM, PANEL_EM = 6.5, 11.1, 19.0
 # Distances of the panels from the window's edges and from each other, em.
@@ -17,6 +19,9 @@ MARGIN_EM, SPACING_EM = 0.8, 0.4
 MAX_BAR_EM = 60.0
 # Width of a message over the room it has.
 MESSAGE_SHARE = 0.88
+
+# Name of a panel that is there whenever a list is open: focusing it closes what is above it.
+LOWEST = "status"
 
 Value = TypeVar("Value")
 
@@ -28,17 +33,35 @@ def em(count: float = 1.0) -> float:
 
 def window_size() -> tuple[float, float]:
     """Return (width, height) of the player's window, screen units."""
-    size = imgui.get_io().display_size
-    return size.x, size.y
+    width, height = imgui.get_io().display_size
+    return width, height
 
 
 @contextlib.contextmanager
-def panel(name: str, flags: int = 0, fits_content: bool = True, scrolls: bool = False) -> Iterator[None]:
-    """Build a window without decoration that cannot be moved."""
-    bare = imgui.WindowFlags_.no_decoration | imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_nav
+def panel(
+    name: str,
+    flags: imgui.WindowFlags = imgui.WindowFlags.NONE,
+    fits_content: bool = True,
+    scrolls: bool = False,
+    is_above: bool = False,
+) -> Iterator[None]:
+    """Build a window without decoration that cannot be moved.
+
+    Args:
+        name: of the window.
+        flags: further flags.
+        fits_content: whether its size is that of its content.
+        scrolls: whether it may be smaller than its content.
+        is_above: whether it comes to the front when it appears or is used; others stay where they are.
+    """
+    bare = imgui.WindowFlags.NO_DECORATION | imgui.WindowFlags.NO_MOVE | imgui.WindowFlags.NO_NAV
     if scrolls:
-        bare &= ~imgui.WindowFlags_.no_scrollbar
-    imgui.begin(f"##{name}", None, bare | flags | (imgui.WindowFlags_.always_auto_resize if fits_content else 0))
+        bare &= ~imgui.WindowFlags.NO_SCROLLBAR
+    if fits_content:
+        bare |= imgui.WindowFlags.ALWAYS_AUTO_RESIZE
+    if not is_above:
+        bare |= imgui.WindowFlags.NO_BRING_TO_FRONT_ON_FOCUS
+    imgui.begin(f"##{name}", False, bare | flags)
     try:
         yield
     finally:
@@ -54,20 +77,25 @@ def place_next(
     min_width: float = 0.0,
 ) -> None:
     """Place the next window: the point at (pivot_x, pivot_y) of its size lies at (x, y)."""
-    imgui.set_next_window_pos(imgui.ImVec2(x, y), imgui.Cond_.always, imgui.ImVec2(pivot_x, pivot_y))
+    imgui.set_next_window_pos((x, y), imgui.Cond.ALWAYS, (pivot_x, pivot_y))
     if max_height is not None:
-        imgui.set_next_window_size_constraints(imgui.ImVec2(min_width, 0), imgui.ImVec2(1e5, max(max_height, 1.0)))
+        imgui.set_next_window_size_constraints((min_width, 0), (1e5, max(max_height, 1.0)))
 
 
 def place_bar(bottom: float) -> None:
     """Place the next window along the lower edge, above `bottom`."""
     width = window_size()[0]
     place_next(width / 2, bottom, 0.5, 1.0)
-    imgui.set_next_window_size(imgui.ImVec2(min(width - em(2 * MARGIN_EM), em(MAX_BAR_EM)), 0))
+    imgui.set_next_window_size((min(width - em(2 * MARGIN_EM), em(MAX_BAR_EM)), 0))
 
 
 def message(
-    name: str, text: str, across: tuple[float, float], y: float, pivot_y: float, colour: imgui.ImVec4 | None = None
+    name: str,
+    text: str,
+    across: tuple[float, float],
+    y: float,
+    pivot_y: float,
+    colour: Colour | None = None,
 ) -> None:
     """Show a wrapped text.
 
@@ -80,11 +108,10 @@ def message(
     """
     place_next(sum(across) / 2, y, 0.5, pivot_y)
     imgui.set_next_window_bg_alpha(0.92)
-    with panel(name, imgui.WindowFlags_.no_inputs):
-        imgui.internal.bring_window_to_display_front(imgui.internal.get_current_window())
+    with panel(name, imgui.WindowFlags.NO_INPUTS, is_above=True):
         imgui.push_text_wrap_pos(MESSAGE_SHARE * (across[1] - across[0]))
         if colour is not None:
-            imgui.push_style_color(imgui.Col_.text, colour)
+            imgui.push_style_color(imgui.Col.TEXT, colour)
         imgui.text(valid_unicode(text))
         if colour is not None:
             imgui.pop_style_color()
@@ -109,16 +136,16 @@ def choice(name: str, present: Value, names: dict[Value, str]) -> Value:
 
 def close_lists() -> bool:
     """Close all lists and menus that are open; return whether there were any."""
-    are_open = imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
+    are_open = imgui.is_popup_open("", imgui.PopupFlags.ANY_POPUP)
     if are_open:
-        imgui.internal.close_popup_to_level(0, True)
+        imgui.set_window_focus(f"##{LOWEST}")
     return are_open
 
 
 def toggle(name: str, is_on: bool) -> bool:
     """Build a button that stays down; return whether it is down."""
     if is_on:
-        imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(ACCENT.x, ACCENT.y, ACCENT.z, 0.55))
+        imgui.push_style_color(imgui.Col.BUTTON, (*ACCENT[:3], 0.55))
     pressed = imgui.button(name)
     if is_on:
         imgui.pop_style_color()

@@ -701,7 +701,7 @@ def test_disk_full_as_the_file_is_written(
 
 
 def test_no_opengl_and_no_window(sets: Path, tmp_path: Path) -> None:
-    blocked = "for name in ('moderngl', 'glfw', 'imgui_bundle', 'OpenGL', 'kpc.player'): sys.modules[name] = None"
+    blocked = "for name in ('moderngl', 'glfw', 'slimgui', 'OpenGL', 'kpc.player'): sys.modules[name] = None"
     process = _subprocess(
         [str(sets / "blender"), "-o", str(tmp_path / "out.kpc"), "--preset", "draft", "--steps", "3"], blocked
     )

@@ -8,7 +8,18 @@ import pytest
 import zstandard
 
 from kpc.format.common.errors import FormatError
-from kpc.format.container.container import ENTRY, EXPANSION_LIMIT, HEADER, Chunk, Codec, Reader, pack, stored_frame
+from kpc.format.container.container import (
+    ENTRY,
+    EXPANSION_LIMIT,
+    HEADER,
+    Chunk,
+    Codec,
+    Entry,
+    Reader,
+    header_and_index,
+    pack,
+    stored_frame,
+)
 
 NOISE = np.random.default_rng(0).integers(0, 256, 300).astype(np.uint8).tobytes()
 CHUNKS = [
@@ -111,6 +122,20 @@ def test_stored_frames_are_frames_of_zstandard(count: int):
     frame = stored_frame(content)
     assert zstandard.get_frame_parameters(frame).content_size == count
     assert zstandard.ZstdDecompressor().decompress(frame, allow_extra_data=False) == content
+
+
+@pytest.mark.parametrize("content", [b"", b"a" * 100], ids=["empty", "full"])
+@pytest.mark.parametrize("more", [b"\0", zstandard.compress(b""), b"\x50\x2a\x4d\x18\0\0\0\0"])
+def test_a_zstd_frame_followed_by_more_is_refused(content: bytes, more: bytes):
+    frame = zstandard.compress(content)
+    for body in (frame, frame + more):
+        entry = Entry("note", 0, 0, 0, 0, 0, Codec.ZSTD, len(body), len(content), google_crc32c.value(body))
+        reader = Reader(header_and_index([entry], 0) + body)
+        if body == frame:
+            assert reader.chunk(0) == content
+        else:
+            with pytest.raises(FormatError, match="no valid zstd frame"):
+                reader.chunk(0)
 
 
 def test_an_index_of_many_empty_chunks_is_not_compressed_too_far():

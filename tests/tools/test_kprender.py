@@ -460,7 +460,7 @@ def test_without_opengl_the_reference_backend_is_offered(run, scene_file: Path, 
 
 def test_the_reference_backend_needs_no_opengl_module(scene_file: Path, tmp_path: Path) -> None:
     program = (
-        "import sys; sys.modules.update(moderngl=None, glfw=None, imgui_bundle=None, torch=None); "
+        "import sys; sys.modules.update(moderngl=None, glfw=None, slimgui=None, torch=None); "
         "from kpc.tools.cli.kprender import main; sys.exit(main())"
     )
     arguments = [str(scene_file), "--time", "0", "-o", str(tmp_path / "x.png"), "--backend", "reference"]

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 from PIL import Image
 
 from kpc.format.common import cli
@@ -68,6 +67,8 @@ def depth_path(path: Path) -> Path:
 def _write_exr(path: Path, picture: Rendering, is_transparent: bool) -> None:
     """Write R, G, B in linear light, multiplied by the alpha A, and Z in world units along the ray, infinite where
     there is no surface. Over a background A is 1."""
+    import OpenEXR
+
     rgb = linear_colours(picture, is_transparent).astype(np.float32)
     alpha = np.clip(picture.opacity, 0, 1) if is_transparent else np.ones_like(picture.opacity)
     rgba = np.ascontiguousarray(np.concatenate([rgb, alpha[..., None]], axis=2), np.float32)
