@@ -90,7 +90,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         else:
             first, last = 0, size - 1
             self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", "application/octet-stream")
+        self.send_header("Content-Type", self.guess_type(self.path.partition("?")[0]))
         self.send_header("Content-Length", str(last + 1 - first))
         self.send_header("Accept-Ranges", "bytes")
         self.send_header("ETag", etag)

@@ -1,4 +1,6 @@
-/** What the package exports. */
+/** What the package exports; importing it makes `<kpc-player>` known. */
+
+import { define } from './element/kpc-player.js';
 
 export type { Entry } from './container/chunk.js';
 export { Container, type Header } from './container/container.js';
@@ -23,6 +25,8 @@ export { type Part, type Span, Timeline } from './container/timeline.js';
 export { Core, type SegmentSymbols } from './decoder/core.js';
 export { loadCore } from './decoder/module.js';
 export { DecoderPool, type PoolOptions } from './decoder/pool.js';
+export { KpcPlayer, type PlayerRanges } from './element/kpc-player.js';
+export type { PlayerError, PlayerErrorCode } from './element/messages.js';
 export { RenderError } from './render/device.js';
 export type { DrawnScene } from './render/drawn_scene.js';
 export type { Moment, ShownPart } from './render/picture_job.js';
@@ -30,3 +34,5 @@ export { LEVEL_NAMES, type Level } from './render/quality.js';
 export { type DrawnPicture, type DrawOptions, Renderer, type RendererOptions } from './render/renderer.js';
 export { Clip, type ClipOptions, type ClipPosition, SceneEvent, type ScenePart } from './streaming/clip.js';
 export type { SceneStream, TexelRows } from './streaming/scene_stream.js';
+
+define();

@@ -36,6 +36,8 @@ export interface DrawnPicture {
   scale: number;
   /** Whether the picture will not become finer while nothing changes: no further call is needed. */
   isSharp: boolean;
+  /** Pictures that have been shown so far, whole ones. */
+  pictures: number;
 }
 
 export interface RendererOptions {
@@ -81,6 +83,7 @@ export class Renderer {
   #shown: Shown | null = null;
   #job: (PictureJob & { versions?: string }) | null = null;
   #secondsPerRay: number;
+  #pictures = 0;
   #isDisposed = false;
 
   /**
@@ -132,6 +135,11 @@ export class Renderer {
     const scene = new DrawnScene(source);
     this.#scenes.add(scene);
     return scene;
+  }
+
+  /** Take rows of a scene that has arrived, as many as a frame has time for; `draw` does so for those that it shows. */
+  upload(scene: DrawnScene): void {
+    if (!this.isLost) scene.upload(this.#device);
   }
 
   removeScene(scene: DrawnScene): void {
@@ -234,6 +242,7 @@ export class Renderer {
       const { view, rung, role, versions = '' } = job;
       this.#shown = { view, rung, role, versions, pictures: job.finish(this.#presentation) };
       this.#job = null;
+      this.#pictures++;
       this.present(screen);
     } else if (screen) {
       this.present(screen);
@@ -254,7 +263,7 @@ export class Renderer {
   }
 
   #state(wanted: Rung, isSharp: boolean): DrawnPicture {
-    return { ...(this.#shown?.rung ?? wanted), isSharp };
+    return { ...(this.#shown?.rung ?? wanted), isSharp, pictures: this.#pictures };
   }
 
   async #untilIdle(): Promise<void> {

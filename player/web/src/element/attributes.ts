@@ -1,0 +1,33 @@
+/** Attributes that properties reflect, as HTML does it. */
+
+export const string = (element: HTMLElement, name: string, missing = ''): string =>
+  element.getAttribute(name) ?? missing;
+
+/** Return the value of an attribute if it is one of some words, else the first of them. */
+export function word<T extends string>(element: HTMLElement, name: string, words: readonly T[]): T {
+  const value = element.getAttribute(name)?.toLowerCase();
+  return words.find((known) => known === value) ?? words[0];
+}
+
+/** Return a positive number; what is missing or no such number counts as `missing`. */
+export function positive(element: HTMLElement, name: string, missing: number): number {
+  const value = Number.parseFloat(element.getAttribute(name) ?? '');
+  return value > 0 && Number.isFinite(value) ? value : missing;
+}
+
+/** Set an attribute, or take it away: null and false. */
+export function set(element: HTMLElement, name: string, value: string | number | boolean | null): void {
+  if (value === null || value === false) element.removeAttribute(name);
+  else element.setAttribute(name, value === true ? '' : String(value));
+}
+
+/** What a page set before the element was defined is set again, now that it has setters. */
+export function upgrade(element: HTMLElement, names: readonly string[]): void {
+  const values = element as unknown as Record<string, unknown>;
+  for (const name of names) {
+    if (!Object.hasOwn(element, name)) continue;
+    const value = values[name];
+    delete values[name];
+    values[name] = value;
+  }
+}

@@ -1,0 +1,241 @@
+/** What the player shows around the picture: poster, bar, panels and messages. */
+
+import type { Commands } from '../commands.js';
+import type { PlayerError } from '../messages.js';
+import { IconButton, make, Popup } from './dom.js';
+import { fillSettings, fillViews, keyList, type Model } from './panels.js';
+import styles from './styles.css?text';
+import { clockText, Timeline } from './timeline.js';
+
+/** Milliseconds for which messages are shown, and after which the bar of a playing clip hides. */
+const [NOTICE_MS, HINT_MS, IDLE_MS] = [4000, 5000, 2500];
+/** Clips shorter than this, in seconds, show tenths. */
+const TENTHS_BELOW_S = 20;
+
+/** What changes while a clip plays. */
+export interface UiState {
+  hasControls: boolean;
+  isMovable: boolean;
+  /** Whether the picture has taken the poster's place. */
+  isShown: boolean;
+  isWaiting: boolean;
+  paused: boolean;
+  ended: boolean;
+  time: number;
+  duration: number;
+  buffered: readonly (readonly [number, number])[];
+  /** Whether to offer a large button to begin with. */
+  isOffered: boolean;
+  isFullscreen: boolean;
+  /** Whether the page leaves all touches to the player. */
+  isWhole: boolean;
+}
+
+export interface UiActions {
+  commands: Commands;
+  seek(seconds: number): void;
+  hold(isHeld: boolean): void;
+  reload(): void;
+}
+
+export class Ui {
+  readonly player: HTMLElement;
+  readonly stage: HTMLElement;
+  readonly #poster = make('img', { class: 'poster', part: 'poster', alt: '', hidden: true });
+  readonly #spinner = make('div', { class: 'spinner', hidden: true });
+  readonly #large: IconButton;
+  readonly #error = make('div', { class: 'error', role: 'alert', hidden: true });
+  readonly #notice = make('div', { class: 'notice', role: 'status' });
+  readonly #hint = make('div', { class: 'hint', 'aria-hidden': 'true' }, 'Drag to look around');
+  readonly #bar: HTMLElement;
+  readonly #play: IconButton;
+  readonly #fill: IconButton;
+  readonly #time = make('span', { class: 'time' });
+  readonly #timeline: Timeline;
+  readonly #popups: readonly Popup[];
+  readonly #keys = make('div', {
+    class: 'panel keys',
+    role: 'dialog',
+    'aria-label': 'Keys',
+    hidden: true,
+    tabindex: -1,
+  });
+  readonly #actions: UiActions;
+  #noticeTimer = 0;
+  #hintTimer = 0;
+  #idleTimer = 0;
+  #isPlaying = false;
+
+  constructor(root: ShadowRoot, model: Model, actions: UiActions) {
+    const { commands } = actions;
+    this.#actions = actions;
+    root.adoptedStyleSheets = [sheet()];
+    this.stage = make('div', { class: 'stage', part: 'stage', tabindex: 0, role: 'application' });
+    this.#large = new IconButton('play', 'Play', () => commands.playOrPause(), { class: 'large', hidden: true });
+    this.#play = new IconButton('play', 'Play', () => commands.playOrPause());
+    this.#fill = new IconButton('fill', 'Fill the screen', () => commands.toggleFullscreen());
+    this.#timeline = new Timeline(actions);
+    this.#popups = [
+      new Popup('view', 'Views', (panel) => this.#opening(panel, () => fillViews(panel, model, commands))),
+      new Popup('settings', 'Settings', (panel) => this.#opening(panel, () => fillSettings(panel, model, commands))),
+    ];
+    const [views, settings] = this.#popups;
+    const link = new IconButton('link', 'Copy link here and now', () => commands.copyLink());
+    const buttons = [views.button, settings.button, link, this.#fill].map(({ element }) => element);
+    this.#bar = make(
+      'div',
+      { class: 'bar', part: 'bar' },
+      this.#timeline.element,
+      make('div', { class: 'buttons' }, this.#play.element, this.#time, make('span', { class: 'space' }), ...buttons),
+    );
+    const cover = make('div', { class: 'cover' }, this.#spinner, this.#large.element, this.#error);
+    const panels = [...this.#popups.map(({ panel }) => panel), this.#keys];
+    this.player = make('div', { class: 'player', part: 'player' });
+    this.player.append(this.stage, this.#poster, make('div', { class: 'ring' }));
+    this.player.append(this.#hint, cover, this.#notice, this.#bar, ...panels);
+    root.append(this.player);
+    for (const type of ['pointermove', 'pointerdown', 'keydown', 'focusin']) {
+      this.player.addEventListener(type, this.#stirred);
+    }
+    this.player.addEventListener(
+      'keydown',
+      (event) => event.key === 'Escape' && this.closePanels() && event.preventDefault(),
+    );
+    this.stage.addEventListener('pointerdown', () => this.closePanels());
+  }
+
+  setPoster(src: string): void {
+    this.#poster.hidden = src === '';
+    if (src !== '' && this.#poster.src !== src) this.#poster.src = src;
+  }
+
+  setTitle(title: string): void {
+    this.stage.ariaLabel = `${title || '4D scene'}. Drag, or press W A S D, to look around; H lists all keys.`;
+  }
+
+  update(state: UiState): void {
+    const { hasControls, isMovable, isShown, isWaiting, paused, ended, isFullscreen, isWhole } = state;
+    this.#bar.hidden = !hasControls;
+    this.stage.classList.toggle('movable', isMovable && isShown);
+    this.stage.classList.toggle('whole', isWhole);
+    this.stage.tabIndex = isMovable || hasControls ? 0 : -1;
+    this.#poster.classList.toggle('done', isShown);
+    const isOffered = hasControls && state.isOffered && this.#error.hidden;
+    this.#large.element.hidden = !isOffered;
+    this.#spinner.hidden = !isWaiting || isOffered || !this.#error.hidden;
+    this.#play.element.hidden = state.duration === 0;
+    this.#time.hidden = state.duration === 0;
+    if (ended) this.#play.show('replay', 'Play again');
+    else this.#play.show(paused ? 'play' : 'pause', paused ? 'Play' : 'Pause');
+    if (isFullscreen) this.#fill.show('leave', 'Leave the full screen');
+    else this.#fill.show('fill', 'Fill the screen');
+    const withTenths = state.duration < TENTHS_BELOW_S;
+    const text = `${clockText(state.time, withTenths)} / ${clockText(state.duration, withTenths)}`;
+    if (this.#time.textContent !== text) this.#time.textContent = text;
+    this.#timeline.update(state);
+    if (this.#isPlaying === paused) {
+      this.#isPlaying = !paused;
+      this.#stirred();
+    }
+  }
+
+  showError(error: PlayerError | null): void {
+    this.#error.hidden = error === null;
+    if (error === null) return;
+    const again = make(
+      'button',
+      { type: 'button', class: 'choice', onclick: () => this.#actions.reload() },
+      'Try again',
+    );
+    this.#error.replaceChildren(make('p', {}, error.message), again);
+    this.#error.dataset.code = error.code;
+  }
+
+  /** Show a message for a while; with `isLasting`, until the next one. An empty one removes it. */
+  notify(content: string | HTMLElement, isLasting = false): void {
+    clearTimeout(this.#noticeTimer);
+    this.#notice.replaceChildren(...(content === '' ? [] : [content]));
+    if (!isLasting) this.#noticeTimer = window.setTimeout(() => this.#notice.replaceChildren(), NOTICE_MS);
+  }
+
+  /** Say once that the view can be moved. */
+  hint(): void {
+    this.#hint.classList.add('shown');
+    this.#hintTimer = window.setTimeout(() => this.endHint(), HINT_MS);
+  }
+
+  endHint(): void {
+    clearTimeout(this.#hintTimer);
+    this.#hint.classList.remove('shown');
+  }
+
+  toggleKeys(): void {
+    const isOpen = !this.#keys.hidden;
+    this.closePanels();
+    if (isOpen) return;
+    if (this.#keys.childElementCount === 0) {
+      const close = make(
+        'button',
+        { type: 'button', class: 'choice wide', onclick: () => this.closePanels() },
+        'Close',
+      );
+      this.#keys.append(keyList(), make('div', { class: 'choices' }, close));
+    }
+    this.#keys.hidden = false;
+    this.#keys.focus();
+  }
+
+  /** Close what is open; return whether anything was. */
+  closePanels(): boolean {
+    const isOpen = !this.#keys.hidden || this.#popups.some((popup) => popup.isOpen);
+    if (!this.#keys.hidden && this.#keys.matches(':focus-within')) this.stage.focus();
+    this.#keys.hidden = true;
+    for (const popup of this.#popups) popup.close();
+    return isOpen;
+  }
+
+  /** Whether the bar is hidden for the moment. */
+  get isIdle(): boolean {
+    return this.player.classList.contains('idle');
+  }
+
+  /** Show the bar, and hide it after a while if the clip plays. */
+  stir(): void {
+    this.#stirred();
+  }
+
+  /** End all timers. */
+  rest(): void {
+    for (const timer of [this.#noticeTimer, this.#hintTimer, this.#idleTimer]) clearTimeout(timer);
+    this.#notice.replaceChildren();
+    this.player.classList.remove('idle');
+  }
+
+  #opening(panel: HTMLElement, fill: () => void): void {
+    this.#keys.hidden = true;
+    for (const popup of this.#popups) if (popup.panel !== panel) popup.close();
+    fill();
+  }
+
+  readonly #stirred = (): void => {
+    clearTimeout(this.#idleTimer);
+    this.player.classList.remove('idle');
+    if (this.#isPlaying) this.#idleTimer = window.setTimeout(this.#idle, IDLE_MS);
+  };
+
+  readonly #idle = (): void => {
+    const isUsed = this.#popups.some((popup) => popup.isOpen) || this.#bar.querySelector(':focus-visible') !== null;
+    if (this.#isPlaying && !isUsed) this.player.classList.add('idle');
+  };
+}
+
+let shared: CSSStyleSheet | null = null;
+
+/** Return the style sheet, one for all players; made when the first one needs it, since node has none. */
+function sheet(): CSSStyleSheet {
+  if (shared === null) {
+    shared = new CSSStyleSheet();
+    shared.replaceSync(styles);
+  }
+  return shared;
+}

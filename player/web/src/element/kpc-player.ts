@@ -1,0 +1,679 @@
+/** The custom element `<kpc-player>`; docs/web.md lists its attributes, properties, methods and events. */
+
+import type { ShownPart } from '../render/picture_job.js';
+import { LEVEL_NAMES, type Level } from '../render/quality.js';
+import { DEFAULT_MEMORY } from '../streaming/clip.js';
+import { positive, set, string, upgrade, word } from './attributes.js';
+import { textOfView, type View, viewFromText, viewOf } from './camera/view.js';
+import { Clock, type ClockEvent } from './clock.js';
+import type { Model } from './controls/panels.js';
+import { Ui } from './controls/ui.js';
+import { Input } from './input.js';
+import { momentOf } from './link.js';
+import { CONTEXT_LOST, type PlayerError, playerErrorOf } from './messages.js';
+import { PlayerCommands } from './player_commands.js';
+import { Session } from './session.js';
+
+const PROPERTIES = [
+  ...['src', 'srcObject', 'poster', 'controls', 'autoplay', 'loop', 'muted', 'playsInline', 'preload', 'currentTime'],
+  ...['playbackRate', 'volume', 'camera', 'cameraControls', 'quality', 'targetFps', 'appearance', 'memory'],
+];
+const TARGET_FPS = 30;
+/** Milliseconds between two `progress` events, and after which it is found out anew whether the page scrolls. */
+const [PROGRESS_MS, PAGE_MS] = [350, 1000];
+const HAVE_FUTURE_DATA = 3;
+
+/** What a player goes on with when it is put back into a page. */
+interface Resumed {
+  time: number;
+  view: string;
+  wasPlaying: boolean;
+}
+
+/** A list of ranges as `HTMLMediaElement.buffered` has it. */
+export interface PlayerRanges {
+  readonly length: number;
+  start(index: number): number;
+  end(index: number): number;
+}
+
+const Base = (globalThis.HTMLElement ?? class {}) as typeof HTMLElement; // servers that render pages have none
+const connected = new Set<KpcPlayer>();
+
+export class KpcPlayer extends Base implements Model {
+  static readonly observedAttributes = [
+    ...[
+      'src',
+      'poster',
+      'controls',
+      'loop',
+      'camera',
+      'camera-controls',
+      'quality',
+      'target-fps',
+      'part',
+      'appearance',
+    ],
+    ...['autoplay', 'muted'],
+  ];
+
+  readonly #clock = new Clock((event) => this.#clocked(event));
+  readonly #commands: PlayerCommands;
+  readonly #ui: Ui;
+  readonly #input: Input;
+  #session: Session | null = null;
+  #error: PlayerError | null = null;
+  #file: Blob | null = null;
+  #volume = 1;
+  #muted: boolean | null = null;
+  #keepsLimits = true;
+  #hasPlayed = false;
+  #plays: { resolve(): void; reject(error: unknown): void }[] = [];
+  /** Where to begin, and from where to look, before that can be done. */
+  #startTime: number | null = null;
+  #startView: string | null = null;
+  #resumed: Resumed | null = null;
+  #readyState = 0;
+  #progressAt = 0;
+  #pageAt = 0;
+  #isWhole = false;
+
+  constructor() {
+    super();
+    const root = this.attachShadow({ mode: 'open' });
+    this.#commands = new PlayerCommands(this, () => this.#ui);
+    this.#ui = new Ui(root, this, {
+      commands: this.#commands,
+      seek: (seconds) => this.#commands.seek(seconds),
+      hold: (isHeld) => {
+        this.#clock.isHeld = isHeld;
+      },
+      reload: () => this.#reload(),
+    });
+    this.#input = new Input(this.#ui.player, this.#ui.stage, {
+      view: () => this.#session?.view ?? null,
+      extent: () => this.#session?.extent ?? 1,
+      isEnabled: () => this.cameraControls,
+      takesWheel: () => this.#isWhole || this.shadowRoot?.activeElement !== null,
+      moved: () => {
+        this.#ui.endHint();
+        this.#session?.wake();
+      },
+      clicked: (event) => this.#clicked(event),
+      commands: this.#commands,
+    });
+    this.addEventListener('fullscreenchange', () => this.#refresh());
+    this.#ui.player.addEventListener('keydown', (event) => {
+      if (event.key === 'Escape' && !event.defaultPrevented) this.#fillWindow(false);
+    });
+    this.#ui.setTitle('');
+  }
+
+  connectedCallback(): void {
+    upgrade(this, PROPERTIES);
+    connected.add(this);
+    window.addEventListener('hashchange', this.#followLink);
+    this.#ui.setPoster(this.poster);
+    if (this.#session === null) this.#start();
+    this.#refresh();
+  }
+
+  disconnectedCallback(): void {
+    // An element that is moved is removed and put back at once.
+    queueMicrotask(() => {
+      if (this.isConnected) return;
+      connected.delete(this);
+      window.removeEventListener('hashchange', this.#followLink);
+      const view = this.#session?.view;
+      if (view) {
+        this.#resumed = { time: this.#clock.time, view: textOfView(view.view), wasPlaying: !this.#clock.paused };
+      }
+      this.#stop();
+    });
+  }
+
+  attributeChangedCallback(name: string, before: string | null, value: string | null): void {
+    if (before === value) return;
+    if (name === 'src' && this.isConnected) this.load();
+    if (name === 'poster') this.#ui.setPoster(this.poster);
+    if (name === 'loop') this.#clock.loop = this.loop;
+    if (name === 'camera' && value !== null) this.camera = value;
+    if (name === 'target-fps' && this.#session) this.#session.fps = this.targetFps;
+    if (name === 'autoplay' && this.autoplay && this.#session?.clip) this.#playByItself();
+    this.#refresh();
+  }
+
+  // --- attributes
+
+  get src(): string {
+    const value = this.getAttribute('src');
+    return value === null ? '' : new URL(value, document.baseURI).href;
+  }
+
+  set src(value: string) {
+    set(this, 'src', value);
+  }
+
+  /** A file that the page has, in place of `src`. */
+  get srcObject(): Blob | null {
+    return this.#file;
+  }
+
+  set srcObject(file: Blob | null) {
+    this.#file = file;
+    if (this.isConnected) this.load();
+  }
+
+  get poster(): string {
+    return string(this, 'poster');
+  }
+
+  set poster(value: string) {
+    set(this, 'poster', value);
+  }
+
+  get controls(): boolean {
+    return this.hasAttribute('controls');
+  }
+
+  set controls(value: boolean) {
+    set(this, 'controls', value);
+  }
+
+  get autoplay(): boolean {
+    return this.hasAttribute('autoplay');
+  }
+
+  set autoplay(value: boolean) {
+    set(this, 'autoplay', value);
+  }
+
+  get loop(): boolean {
+    return this.hasAttribute('loop');
+  }
+
+  set loop(value: boolean) {
+    set(this, 'loop', value);
+  }
+
+  get playsInline(): boolean {
+    return this.hasAttribute('playsinline');
+  }
+
+  set playsInline(value: boolean) {
+    set(this, 'playsinline', value);
+  }
+
+  get preload(): string {
+    return word(this, 'preload', ['auto', 'metadata', 'none']);
+  }
+
+  set preload(value: string) {
+    set(this, 'preload', value);
+  }
+
+  /** Whether hands may move the view: with `controls`, unless `camera-controls` is "none". */
+  get cameraControls(): boolean {
+    return string(this, 'camera-controls', this.controls ? '' : 'none').toLowerCase() !== 'none';
+  }
+
+  set cameraControls(value: boolean) {
+    set(this, 'camera-controls', value ? '' : 'none');
+  }
+
+  get quality(): Level | 'auto' {
+    return word(this, 'quality', ['auto', ...LEVEL_NAMES]);
+  }
+
+  set quality(value: string) {
+    set(this, 'quality', value);
+  }
+
+  get targetFps(): number {
+    return positive(this, 'target-fps', TARGET_FPS);
+  }
+
+  set targetFps(value: number) {
+    set(this, 'target-fps', value);
+  }
+
+  /** What the attribute `part` says; the property of that name is every element's list of tokens. */
+  get shownPart(): ShownPart {
+    return word(this, 'part', ['all', 'static', 'dynamic']);
+  }
+
+  set shownPart(value: string) {
+    set(this, 'part', value);
+  }
+
+  get appearance(): string {
+    return string(this, 'appearance');
+  }
+
+  set appearance(value: string) {
+    set(this, 'appearance', value);
+  }
+
+  get memory(): number {
+    return positive(this, 'memory', DEFAULT_MEMORY);
+  }
+
+  set memory(value: number) {
+    set(this, 'memory', value);
+  }
+
+  // --- playing
+
+  get currentTime(): number {
+    return this.#session?.clip ? this.#clock.time : (this.#startTime ?? 0);
+  }
+
+  set currentTime(seconds: number) {
+    if (!Number.isFinite(seconds)) throw new TypeError('currentTime must be a finite number');
+    if (this.#session?.clip) {
+      this.#clock.seek(seconds);
+      this.#fetch();
+    } else {
+      this.#startTime = Math.max(seconds, 0);
+    }
+  }
+
+  get duration(): number {
+    return this.#session?.clip?.duration ?? Number.NaN;
+  }
+
+  get paused(): boolean {
+    return this.#clock.paused;
+  }
+
+  get ended(): boolean {
+    return this.#clock.ended;
+  }
+
+  get seeking(): boolean {
+    return this.#clock.isSeeking;
+  }
+
+  get playbackRate(): number {
+    return this.#clock.rate;
+  }
+
+  set playbackRate(rate: number) {
+    if (!(rate > 0 && rate <= 16))
+      throw new DOMException('playbackRate must be above 0 and at most 16', 'NotSupportedError');
+    this.#clock.rate = rate;
+  }
+
+  get volume(): number {
+    return this.#volume;
+  }
+
+  set volume(value: number) {
+    if (!(value >= 0 && value <= 1)) throw new DOMException('volume must be from 0 to 1', 'IndexSizeError');
+    if (value === this.#volume) return;
+    this.#volume = value;
+    this.#emit('volumechange');
+  }
+
+  get muted(): boolean {
+    return this.#muted ?? this.hasAttribute('muted');
+  }
+
+  set muted(value: boolean) {
+    if (value === this.muted) return;
+    this.#muted = value;
+    this.#emit('volumechange');
+  }
+
+  get buffered(): PlayerRanges {
+    const ranges = this.#session?.clip?.buffered ?? [];
+    const bound = (index: number, end: 0 | 1) => {
+      if (!(index in ranges)) throw new DOMException(`there is no range ${index}`, 'IndexSizeError');
+      return ranges[index][end];
+    };
+    return { length: ranges.length, start: (index) => bound(index, 0), end: (index) => bound(index, 1) };
+  }
+
+  get readyState(): number {
+    return this.#session?.readyState ?? 0;
+  }
+
+  get error(): PlayerError | null {
+    return this.#error;
+  }
+
+  /** Play; resolves when the clip moves, or at once if nothing in it does. */
+  play(): Promise<void> {
+    if (this.#error) return Promise.reject(new DOMException(this.#error.message, 'NotSupportedError'));
+    const promise = new Promise<void>((resolve, reject) => this.#plays.push({ resolve, reject }));
+    this.#hasPlayed = true;
+    this.#clock.play();
+    if (this.#session === null && this.isConnected) this.#start(true);
+    this.#fetch();
+    if (this.duration === 0) this.#clock.pause();
+    else if (!this.#clock.isWaiting) this.#settlePlays();
+    return promise;
+  }
+
+  pause(): void {
+    this.#clock.pause();
+    this.#session?.wake();
+  }
+
+  /** Begin anew, with whatever `src` names now. */
+  load(): void {
+    this.#stop();
+    this.#resumed = null;
+    this.#hasPlayed = false;
+    this.#start(true);
+    this.#refresh();
+  }
+
+  /** Pause, and go some frames forward. */
+  step(frames: number): void {
+    this.#clock.step(frames);
+    this.#fetch();
+  }
+
+  /** Choose the next faster speed of the list, or with -1 the next slower one. */
+  changeSpeed(steps: number): void {
+    this.#clock.changeSpeed(steps);
+  }
+
+  // --- looking
+
+  /** From where to look: the eye, the point looked at, and the vertical angle of view in degrees. */
+  get camera(): string {
+    const view = this.#session?.view;
+    return view ? textOfView(view.view) : (this.#startView ?? string(this, 'camera'));
+  }
+
+  /** A name of `presets` or `cameras`, "opening", or six or seven numbers. */
+  set camera(text: string) {
+    const session = this.#session;
+    if (!session?.view) {
+      this.#startView = text;
+      return;
+    }
+    const view = this.#viewOf(text);
+    if (view === null) console.warn(`kpc-player: there is no camera "${text}"`);
+    else session.view.lookFrom(view);
+    session.wake();
+  }
+
+  get presets(): readonly string[] {
+    return [...(this.#session?.presets.keys() ?? [])];
+  }
+
+  get cameras(): readonly string[] {
+    const { cameras = [], metadata = {} } = this.#session?.clip ?? {};
+    return cameras.map((_, number) => metadata.camera_names?.[number] ?? `camera ${number + 1}`);
+  }
+
+  get appearances(): readonly string[] {
+    return (this.#session?.clip?.scenes[0].appearances ?? []).map(({ name }) => name);
+  }
+
+  get levels(): readonly string[] {
+    return LEVEL_NAMES;
+  }
+
+  get isDynamic(): boolean {
+    return this.#session?.isDynamic ?? false;
+  }
+
+  get hasLimits(): boolean {
+    return Boolean(this.#session?.view?.limits);
+  }
+
+  /** Whether the view comes back to where the scene holds, if the file says where. */
+  get keepsLimits(): boolean {
+    return this.#keepsLimits;
+  }
+
+  set keepsLimits(value: boolean) {
+    this.#keepsLimits = value;
+    const view = this.#session?.view;
+    if (view && view.keepsLimits !== value) view.toggleLimits();
+    this.#session?.wake();
+  }
+
+  /** What the file says of itself; an empty object before it is there. */
+  get metadata(): Readonly<Record<string, unknown>> {
+    return this.#session?.clip?.metadata ?? {};
+  }
+
+  /** The file's name without its suffix, for files that are saved. */
+  get fileStem(): string {
+    const name = this.#file ? ((this.#file as File).name ?? '') : new URL(this.src || 'about:scene').pathname;
+    return (name.split('/').pop() ?? '').replace(/\.kpc$/i, '') || 'scene';
+  }
+
+  /** Return what is shown as a picture file; a paused picture is drawn as finely as it will be first. */
+  async toBlob(type = 'image/png', quality?: number): Promise<Blob> {
+    if (!this.#session) throw new DOMException('there is no picture yet', 'InvalidStateError');
+    return this.#session.toBlob(type, quality);
+  }
+
+  override async requestFullscreen(options?: FullscreenOptions): Promise<void> {
+    if (document.fullscreenEnabled) await super.requestFullscreen(options);
+    else this.#fillWindow(true);
+  }
+
+  toggleFullscreen(): void {
+    if (this.matches(':fullscreen')) document.exitFullscreen();
+    else if (this.hasAttribute('data-fills-window')) this.#fillWindow(false);
+    else this.requestFullscreen().catch(() => this.#fillWindow(true));
+  }
+
+  // --- inside
+
+  /** Open what `src` names; with preload="none" only if `isAsked`. */
+  #start(isAsked = false): void {
+    const src = this.#file ?? this.src;
+    if (src === '' || !this.isConnected) return;
+    const mayPlay = this.autoplay && !isReducedMotion();
+    if (this.preload === 'none' && !mayPlay && !isAsked) return;
+    this.#clock.loop = this.loop;
+    const session = new Session(
+      {
+        ...{ src, memory: this.memory, fps: this.targetFps, clock: this.#clock, stage: this.#ui.stage },
+        workerUrl: this.getAttribute('worker-url'),
+        shown: () => ({
+          level: this.quality,
+          part: this.shownPart,
+          appearance: this.appearance,
+        }),
+      },
+      this.#input,
+      {
+        opened: () => this.#opened(),
+        shown: () => this.#shown(),
+        progress: () => this.#progressed(),
+        viewChanged: () => this.#emit('camera-change'),
+        lost: (isLost) => this.#ui.notify(isLost ? CONTEXT_LOST : '', isLost),
+        failed: (error) => this.#failed(error),
+        frame: () => this.#refresh(),
+      },
+    );
+    session.fetches = this.preload !== 'metadata' || mayPlay || !this.#clock.paused;
+    this.#session = session;
+    this.#emit('loadstart');
+    session.open();
+  }
+
+  /** End whatever goes on; nothing is left but the element itself. */
+  #stop(): void {
+    this.#session?.close();
+    this.#session = null;
+    this.#error = null;
+    this.#readyState = 0;
+    this.#settlePlays(new DOMException('loading was ended', 'AbortError'));
+    this.#clock.reset();
+    this.#ui.rest();
+    this.#ui.showError(null);
+  }
+
+  #reload(): void {
+    const hasPlayed = this.#hasPlayed;
+    this.load();
+    this.#hasPlayed = hasPlayed;
+  }
+
+  #opened(): void {
+    const { clip, view } = this.#session as Session;
+    if (clip === null || view === null) return;
+    view.hasInertia = !isReducedMotion();
+    if (!this.#keepsLimits) view.toggleLimits();
+    const { duration, frameCount, metadata } = clip;
+    Object.assign(this.#clock, { duration, frameCount });
+    const link = this.#resumed ? null : momentOf(location.hash, this.id, this.#isFirst);
+    const { time, view: resumedView } = this.#resumed ?? { time: null, view: null };
+    this.#clock.begin(link?.time ?? time ?? this.#startTime ?? (metadata.opening?.time ?? 0) * duration);
+    const text = link?.camera ?? resumedView ?? this.#startView ?? string(this, 'camera');
+    if (text !== '') this.camera = text;
+    this.#ui.setTitle(typeof metadata.title === 'string' ? metadata.title : '');
+    this.#emit('durationchange');
+    this.#emit('loadedmetadata');
+    if (this.#resumed ? this.#resumed.wasPlaying && this.autoplay : this.autoplay) this.#playByItself();
+    [this.#resumed, this.#startTime, this.#startView] = [null, null, null];
+    if (duration === 0 && !this.#clock.paused) this.#clock.pause();
+    this.#refresh();
+  }
+
+  #playByItself(): void {
+    if (!isReducedMotion()) this.play().catch(() => {});
+  }
+
+  #shown(): void {
+    this.#emit('loadeddata');
+    if (this.cameraControls && this.controls && !isReducedMotion()) this.#ui.hint();
+  }
+
+  #progressed(): void {
+    const now = performance.now();
+    if (now - this.#progressAt < PROGRESS_MS && !this.#session?.clip?.isSettled) return;
+    this.#progressAt = now;
+    this.#emit('progress');
+  }
+
+  #failed(thrown: unknown): void {
+    const error = playerErrorOf(thrown, this.src, location.origin);
+    if (error.code === 'aborted') return;
+    this.#error = error;
+    this.#clock.pause();
+    this.#settlePlays(new DOMException(error.message, 'NotSupportedError'));
+    this.#ui.showError(error);
+    this.#refresh();
+    this.#emit('error');
+  }
+
+  #clocked(event: ClockEvent): void {
+    if (event === 'playing') this.#settlePlays();
+    if (event === 'pause')
+      this.#settlePlays(this.duration === 0 ? undefined : new DOMException('paused', 'AbortError'));
+    this.#emit(event);
+  }
+
+  /** Resolve the promises of `play`, or reject them with an error. */
+  #settlePlays(error?: DOMException): void {
+    const plays = this.#plays;
+    this.#plays = [];
+    for (const { resolve, reject } of plays) {
+      if (error) reject(error);
+      else resolve();
+    }
+  }
+
+  /** Fetch what the playhead needs from now on, whatever `preload` says. */
+  #fetch(): void {
+    if (!this.#session) return;
+    this.#session.fetches = true;
+    this.#session.wake();
+  }
+
+  /** Return the view that a name or numbers say; null if they say none. */
+  #viewOf(text: string): View | null {
+    const { clip, view, presets } = this.#session as Session;
+    if (clip === null || view === null) return null;
+    const { rig } = view;
+    const opening = clip.metadata.opening?.camera ?? rig.cameras[0];
+    const named = text === 'opening' ? opening : (presets.get(text) ?? clip.cameras[this.cameras.indexOf(text)]);
+    return named ? viewOf(rig, named) : viewFromText(rig, text, opening);
+  }
+
+  get #isFirst(): boolean {
+    return connected.values().next().value === this;
+  }
+
+  readonly #followLink = (): void => {
+    const moment = momentOf(location.hash, this.id, this.#isFirst);
+    if (moment?.time != null) this.currentTime = moment.time;
+    if (moment?.camera != null) this.camera = moment.camera;
+  };
+
+  /** A click plays or pauses, and a second one fills the screen; a touch shows the bar of a clip that plays. */
+  #clicked(event: PointerEvent): void {
+    if (!this.controls || this.#error) return;
+    const wasIdle = this.#ui.isIdle;
+    this.#ui.stir();
+    if (event.pointerType === 'mouse') this.#commands.playOrPause();
+    else if (!wasIdle && this.paused) this.#commands.playOrPause();
+  }
+
+  #fillWindow(fills: boolean): void {
+    set(this, 'data-fills-window', fills);
+    this.#refresh();
+  }
+
+  /** Show the present state around the picture, and say what has changed. */
+  #refresh(): void {
+    const session = this.#session;
+    const clock = this.#clock;
+    const now = performance.now();
+    const isFullscreen = this.matches(':fullscreen') || this.hasAttribute('data-fills-window');
+    if (now - this.#pageAt > PAGE_MS) {
+      this.#pageAt = now;
+      const page = document.scrollingElement;
+      this.#isWhole = page !== null && page.scrollHeight <= page.clientHeight;
+    }
+    const { readyState } = this;
+    if (readyState >= HAVE_FUTURE_DATA && this.#readyState < HAVE_FUTURE_DATA) this.#emit('canplay');
+    this.#readyState = readyState;
+    const isShown = session?.isShown ?? false;
+    const isStarting = session !== null && !isShown && session.fetches;
+    const duration = session?.clip?.duration ?? 0;
+    this.#ui.update({
+      hasControls: this.controls,
+      isMovable: this.cameraControls,
+      isShown,
+      isWaiting: isStarting || (isShown && (clock.isSeeking || clock.isWaiting)),
+      isOffered: !this.#hasPlayed && clock.paused && (session === null ? this.src !== '' : duration > 0 && !isStarting),
+      paused: clock.paused,
+      ended: clock.ended,
+      time: clock.time,
+      duration,
+      buffered: session?.clip?.buffered ?? [],
+      isFullscreen,
+      isWhole: this.#isWhole || isFullscreen,
+    });
+    session?.wakeIfChanged(`${this.quality} ${this.shownPart} ${this.appearance}`);
+  }
+
+  #emit(type: string): void {
+    this.dispatchEvent(new Event(type));
+  }
+}
+
+const isReducedMotion = (): boolean => matchMedia('(prefers-reduced-motion: reduce)').matches;
+
+/** Make `<kpc-player>` known to the page. */
+export function define(): void {
+  if (globalThis.customElements && !customElements.get('kpc-player')) customElements.define('kpc-player', KpcPlayer);
+}
+
+declare global {
+  interface HTMLElementTagNameMap {
+    'kpc-player': KpcPlayer;
+  }
+}

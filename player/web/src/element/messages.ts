@@ -1,0 +1,71 @@
+/** What went wrong, in sentences for people who watch. */
+
+import { type ErrorCode, KpcError } from '../container/errors.js';
+
+export type PlayerErrorCode = ErrorCode | 'unknown';
+
+/** The value of the property `error`. */
+export interface PlayerError {
+  readonly code: PlayerErrorCode;
+  /** A sentence for people. */
+  readonly message: string;
+  /** What exactly, for those who look after the page. */
+  readonly detail: string;
+}
+
+export const CONTEXT_LOST =
+  'The browser has taken the graphics card away for a moment. The picture comes back by itself.';
+
+/** Return what the property `error` says of something that was thrown. */
+export function playerErrorOf(thrown: unknown, src: string, origin: string): PlayerError {
+  const detail = thrown instanceof Error ? thrown.message : String(thrown);
+  const code = codeOf(thrown);
+  return { code, message: sentenceOf(code, detail, src, origin), detail };
+}
+
+function codeOf(thrown: unknown): PlayerErrorCode {
+  if (thrown instanceof KpcError) return thrown.code;
+  return thrown instanceof RangeError && /memory|allocation/i.test(thrown.message) ? 'budget' : 'unknown';
+}
+
+function sentenceOf(code: PlayerErrorCode, detail: string, src: string, origin: string): string {
+  switch (code) {
+    case 'not-found':
+      return 'There is no such file. The address may have changed.';
+    case 'blocked':
+      return `The server ${hostOf(src)} does not let this page read the file. Its answers need the header Access-Control-Allow-Origin: ${origin}`;
+    case 'network':
+      return 'The file cannot be fetched. Check the connection, then try again.';
+    case 'replaced':
+      return 'The file was replaced while it was read. Try again to see the new one.';
+    case 'foreign':
+      return 'This is not a .kpc file.';
+    case 'draft':
+      return 'This file has a draft version of the format, which is no longer read. Encode the scene again.';
+    case 'newer':
+      return 'This file is newer than this player. Reload the page, or ask its owner to update the player.';
+    case 'cut-off':
+      return 'The file is incomplete. Its owner should upload it again.';
+    case 'damaged':
+    case 'invalid':
+      return `The file is damaged: ${detail}. Its owner should upload it again.`;
+    case 'budget':
+      return 'This scene needs more memory than the player may use here. Close other pages, or use another device.';
+    case 'worker':
+      return `The decoder cannot run in this page: ${detail}.`;
+    case 'no-webgl':
+      return 'This browser has no WebGL2, which draws the scene. Update it, or allow it to use the graphics card.';
+    case 'graphics':
+      return `This browser cannot draw the scene: ${detail}.`;
+    default:
+      return `The scene cannot be shown: ${detail}.`;
+  }
+}
+
+function hostOf(src: string): string {
+  try {
+    return new URL(src).host;
+  } catch {
+    return 'of the file';
+  }
+}

@@ -1,0 +1,101 @@
+/** A canvas on which scenes of a clip are drawn. */
+
+import type { Camera } from '../container/scene_chunks.js';
+import type { DrawnScene } from '../render/drawn_scene.js';
+import type { ShownPart } from '../render/picture_job.js';
+import type { Level } from '../render/quality.js';
+import { Renderer } from '../render/renderer.js';
+import type { Clip } from '../streaming/clip.js';
+import type { SceneStream } from '../streaming/scene_stream.js';
+
+export interface PictureOptions {
+  fps: number;
+  onLost(): void;
+  onRestored(): void;
+}
+
+export interface ShownOptions {
+  level: Level | 'auto';
+  part: ShownPart;
+  /** Name of an appearance; an empty one is the average. */
+  appearance: string;
+}
+
+export class Picture {
+  readonly canvas: HTMLCanvasElement;
+  readonly #renderer: Renderer;
+  readonly #scenes = new Map<SceneStream, DrawnScene>();
+
+  /** @throws RenderError: the browser cannot draw. */
+  constructor(options: PictureOptions) {
+    this.canvas = document.createElement('canvas');
+    this.#renderer = new Renderer(this.canvas, options);
+  }
+
+  get isLost(): boolean {
+    return this.#renderer.isLost;
+  }
+
+  set fps(fps: number) {
+    this.#renderer.pace.secondsPerFrame = 1 / fps;
+  }
+
+  /** Set the size in pixels of the screen. */
+  resize(width: number, height: number): void {
+    if (this.canvas.width === width && this.canvas.height === height) return;
+    Object.assign(this.canvas, { width, height });
+    this.#renderer.present(); // stretched, until there is one of that size
+  }
+
+  /** Take what has arrived of scenes that are shown or will be; return whether there was anything. */
+  take(clip: Clip): boolean {
+    const drawn = clip.scenes.map((scene) => this.#drawn(scene));
+    const before = drawn.map(({ version }) => version);
+    for (const scene of drawn) this.#renderer.upload(scene);
+    return drawn.some(({ version }, i) => version !== before[i]);
+  }
+
+  /**
+   * Draw what a camera sees of a clip at a time, or go on with that.
+   * @returns how many pictures have been shown so far, and whether the last one will not become finer by itself.
+   */
+  draw(clip: Clip, time: number, camera: Camera, { level, part, appearance }: ShownOptions) {
+    const parts = clip.parts(time);
+    const moments = parts.map(({ scene, time, share }) => ({ scene: this.#drawn(scene), time, share }));
+    const found = parts[0].scene.appearances.find(({ name }) => name === appearance);
+    return this.#renderer.draw(camera, moments, { level, part, appearance: found?.embedding ?? null });
+  }
+
+  /** Forget a scene that the clip no longer holds. */
+  release(scene: SceneStream): void {
+    const drawn = this.#scenes.get(scene);
+    if (drawn) this.#renderer.removeScene(drawn);
+    this.#scenes.delete(scene);
+  }
+
+  /** Return the picture as a file. */
+  toBlob(type: string, quality?: number): Promise<Blob> {
+    this.#renderer.present();
+    return new Promise((resolve, reject) => {
+      const done = (blob: Blob | null) =>
+        blob ? resolve(blob) : reject(new Error(`cannot make a picture of ${type}`));
+      this.canvas.toBlob(done, type, quality);
+    });
+  }
+
+  /** Give everything back; browsers allow a page a few contexts only. */
+  dispose(): void {
+    this.#scenes.clear();
+    this.#renderer.dispose();
+    this.#renderer.gl.getExtension('WEBGL_lose_context')?.loseContext();
+    this.canvas.remove();
+  }
+
+  #drawn(scene: SceneStream): DrawnScene {
+    const known = this.#scenes.get(scene);
+    if (known) return known;
+    const drawn = this.#renderer.addScene(scene);
+    this.#scenes.set(scene, drawn);
+    return drawn;
+  }
+}

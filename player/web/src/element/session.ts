@@ -1,0 +1,261 @@
+/** A clip that is being shown: it is fetched, drawn frame by frame, and moved by hands. */
+
+import type { SceneEvent } from '../streaming/clip.js';
+import { Clip } from '../streaming/clip.js';
+import { Limits } from './camera/limits.js';
+import { Rig } from './camera/rig.js';
+import { cameraOf, type View } from './camera/view.js';
+import { ViewControl } from './camera/view_control.js';
+import type { Clock } from './clock.js';
+import type { Input } from './input.js';
+import { Picture, type ShownOptions } from './picture.js';
+
+/** Pixels of the picture a CSS pixel spans at most, and pixels of the picture at most. */
+const [MOST_RATIO, MOST_PIXELS] = [2, 1 << 22];
+/** The share of a second that must have arrived beyond the playhead for the clip to go on. */
+const FUTURE_S = 0.1;
+
+export interface SessionOptions {
+  src: string | Blob;
+  memory: number;
+  workerUrl: string | null;
+  fps: number;
+  clock: Clock;
+  /** Where the picture goes. */
+  stage: HTMLElement;
+  shown(): ShownOptions;
+}
+
+export interface SessionEvents {
+  /** Header, index and cameras have arrived. */
+  opened(): void;
+  /** The first picture is there. */
+  shown(): void;
+  /** More has arrived. */
+  progress(): void;
+  viewChanged(): void;
+  lost(isLost: boolean): void;
+  failed(error: unknown): void;
+  /** A frame is over. */
+  frame(): void;
+}
+
+export class Session {
+  /** Whether something has been drawn. */
+  isShown = false;
+  /** Pictures that have been shown so far. */
+  pictures = 0;
+  /** Whether what is fetched follows the playhead; false waits after the header. */
+  fetches = true;
+  clip: Clip | null = null;
+  view: ViewControl | null = null;
+  presets = new Map<string, View['lens']>();
+  readonly #options: SessionOptions;
+  readonly #events: SessionEvents;
+  readonly #input: Input;
+  readonly #opening = new AbortController();
+  readonly #resizes = new ResizeObserver((entries) => this.#resized(entries[0]));
+  readonly #sight = new IntersectionObserver((entries) => this.#sighted(entries[entries.length - 1].isIntersecting));
+  #picture: Picture | null = null;
+  #size: [number, number] = [0, 0];
+  #isInSight = true;
+  #isReduced = false;
+  #isSharp = false;
+  #request = 0;
+  #lastFrame = 0;
+  #shownView: View | null = null;
+  #shownWords = '';
+  #isClosed = false;
+
+  constructor(options: SessionOptions, input: Input, events: SessionEvents) {
+    this.#options = options;
+    this.#input = input;
+    this.#events = events;
+    this.#resizes.observe(options.stage);
+    this.#sight.observe(options.stage);
+  }
+
+  async open(): Promise<void> {
+    const { src, memory, workerUrl, stage, fps } = this.#options;
+    try {
+      const pool = workerUrl === null ? {} : { workerUrl };
+      const clip = await Clip.open(src, { memory, signal: this.#opening.signal, pool });
+      if (this.#isClosed) return clip.close();
+      this.clip = clip;
+      const { aabb } = clip.scenes[0].head;
+      const { up, view_limits: limits, opening } = clip.metadata;
+      const rig = new Rig(clip.cameras, aabb, up);
+      this.view = new ViewControl(rig, limits && up ? new Limits(limits, up) : null, opening?.camera ?? rig.cameras[0]);
+      this.presets = rig.presets();
+      clip.addEventListener('arrived', this.#arrived);
+      clip.addEventListener('error', () => this.#failed(clip.error));
+      clip.addEventListener('release', (event) => this.#picture?.release((event as SceneEvent).scene));
+      this.#picture = new Picture({
+        fps,
+        onLost: () => this.#events.lost(true),
+        onRestored: () => {
+          this.#events.lost(false);
+          this.wake();
+        },
+      });
+      stage.append(this.#picture.canvas);
+      this.#events.opened();
+      this.wake();
+    } catch (error) {
+      if (!this.#isClosed) this.#failed(error);
+    }
+  }
+
+  get extent(): number {
+    const box = this.clip?.scenes[0].head.aabb ?? [0, 0, 0, 1, 1, 1];
+    return Math.max(box[3] - box[0], box[4] - box[1], box[5] - box[2]);
+  }
+
+  get isDynamic(): boolean {
+    return this.clip?.scenes[0].head.isDynamic ?? false;
+  }
+
+  /** How much is there, as of HTMLMediaElement. */
+  get readyState(): number {
+    const { clip } = this;
+    const { time, duration } = this.#options.clock;
+    if (clip === null) return 0;
+    if (!this.isShown || !clip.canShow(time)) return 1;
+    const [, until] = clip.buffered.find(([from, to]) => from <= time + 1e-6 && time <= to + 1e-6) ?? [0, time];
+    if (until >= duration - 1e-6) return 4;
+    return until >= time + FUTURE_S ? 3 : 2;
+  }
+
+  get isSharp(): boolean {
+    return this.#isSharp;
+  }
+
+  set fps(fps: number) {
+    if (this.#picture) this.#picture.fps = fps;
+  }
+
+  /** Draw at the next opportunity, and go on as long as something changes. */
+  wake(): void {
+    if (this.#request === 0 && !this.#isClosed) this.#request = requestAnimationFrame((now) => this.#frame(now));
+  }
+
+  /** Draw again if what is to be shown, in words, is not what it was. */
+  wakeIfChanged(shown: string): void {
+    if (shown === this.#shownWords) return;
+    this.#shownWords = shown;
+    this.#isSharp = false;
+    this.wake();
+  }
+
+  /** Return the picture as a file, once it is as fine as it will be; while the clip plays, at once. */
+  async toBlob(type: string, quality?: number): Promise<Blob> {
+    const { clock } = this.#options;
+    for (let frames = 0; frames < 600 && clock.paused && !this.#isSharp && !this.#isClosed; frames++) {
+      this.wake();
+      await new Promise(requestAnimationFrame);
+    }
+    if (this.#picture === null || !this.isShown) throw new DOMException('there is no picture yet', 'InvalidStateError');
+    return this.#picture.toBlob(type, quality);
+  }
+
+  close(): void {
+    this.#isClosed = true;
+    this.#opening.abort();
+    cancelAnimationFrame(this.#request);
+    this.#resizes.disconnect();
+    this.#sight.disconnect();
+    this.clip?.close();
+    this.#picture?.dispose();
+    this.clip = this.view = this.#picture = null;
+  }
+
+  #frame(now: number): void {
+    this.#request = 0;
+    const { clip, view } = this;
+    if (clip === null || view === null) return;
+    const { clock } = this.#options;
+    // The first frame after a pause takes no time.
+    const seconds = this.#lastFrame === 0 ? 0 : (now - this.#lastFrame) / 1000;
+    this.#input.advance(seconds);
+    const isMoving = view.advance(seconds) || this.#input.isActive;
+    if (this.fetches) clip.setPlayhead({ time: clock.time, rate: clock.speed, loop: clock.loop });
+    clock.tick(seconds, (time) => this.isShown && clip.canShow(time));
+    if (this.#isClosed) return; // by a listener
+    if (view.view !== this.#shownView) {
+      if (this.#shownView !== null) this.#events.viewChanged();
+      this.#shownView = view.view;
+    }
+    try {
+      this.#draw();
+    } catch (error) {
+      this.#reduceOrFail(error);
+    }
+    if (this.#isClosed) return;
+    this.#events.frame();
+    const isGoing = isMoving || !clock.paused || clock.isSeeking || !this.#isSharp;
+    this.#lastFrame = isGoing ? now : 0;
+    if (isGoing) this.wake();
+  }
+
+  #draw(): void {
+    const { clip, view } = this;
+    const [width, height] = this.#size;
+    if (clip === null || view === null || this.#picture === null || width === 0 || height === 0) return;
+    const { time, isSeeking } = this.#options.clock;
+    const hasTaken = this.#picture.take(clip);
+    // Nothing that is worse than the poster, or than the picture before a jump.
+    if (!this.#isInSight || !(clip.canShow(time) || (this.isShown && !isSeeking))) {
+      this.#isSharp = !hasTaken;
+      return;
+    }
+    this.#picture.resize(width, height);
+    const camera = cameraOf(view.view, width, height);
+    const { pictures, isSharp } = this.#picture.draw(clip, time, camera, this.#shownOptions());
+    this.pictures = pictures;
+    this.#isSharp = isSharp;
+    if (pictures > 0 && !this.isShown) {
+      this.isShown = true;
+      this.#events.shown();
+    }
+  }
+
+  #shownOptions(): ShownOptions {
+    const shown = this.#options.shown();
+    return this.#isReduced ? { ...shown, level: 'fastest' } : shown;
+  }
+
+  /** Try once with as little memory as possible before giving up. */
+  #reduceOrFail(error: unknown): void {
+    if (this.#isReduced) {
+      this.#failed(error);
+      return;
+    }
+    this.#isReduced = true;
+    this.#size = [Math.ceil(this.#size[0] / 2), Math.ceil(this.#size[1] / 2)];
+    this.wake();
+  }
+
+  #failed(error: unknown): void {
+    this.#events.failed(error);
+  }
+
+  readonly #arrived = (): void => {
+    this.#events.progress();
+    this.wake();
+  };
+
+  #resized(entry: ResizeObserverEntry): void {
+    const ratio = Math.min(devicePixelRatio, MOST_RATIO);
+    const { width, height } = entry.contentRect;
+    const pixels = width * height * ratio * ratio;
+    const scale = (pixels > MOST_PIXELS ? Math.sqrt(MOST_PIXELS / pixels) : 1) * ratio * (this.#isReduced ? 0.5 : 1);
+    this.#size = [Math.round(width * scale), Math.round(height * scale)];
+    this.#isSharp = false;
+    this.wake();
+  }
+
+  #sighted(isInSight: boolean): void {
+    this.#isInSight = isInSight;
+    this.wake();
+  }
+}
