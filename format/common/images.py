@@ -142,10 +142,10 @@ def read_mask(path: str | os.PathLike[str], *, upright: bool = False) -> np.ndar
             return _oriented(image, usable, orientation, upright)
 
 
-def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> None:
+def write_image(path: str | os.PathLike[str], pixels: np.ndarray, jpeg_quality: int = 95) -> None:
     """Write a (height, width, 3 or 4) uint8 image as PNG or JPEG, chosen by the suffix."""
     with atomic_write(path) as temporary:
-        Image.fromarray(pixels).save(temporary, quality=95)  # the quality concerns JPEG only
+        Image.fromarray(pixels).save(temporary, quality=jpeg_quality)
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:

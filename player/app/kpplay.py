@@ -8,6 +8,7 @@ kpplay scene.kpc --quality fast                        a quality level, from fas
 kpplay scene.kpc --target-fps 30                       changes the quality to hold a frame rate
 kpplay scene.kpc --path path.json --folder videos      a camera path to follow; where videos and screenshots go
 kpplay scene.kpc --frames 30 --screenshot out.png      show 30 frames, save the window, and exit
+kpplay --web scene.kpc                                 plays in the browser of this machine
 """
 
 import argparse
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 DEFAULT_HEIGHT, MIN_WIDTH, MAX_WIDTH = 720, 480, 1600
 # Resets of the graphics card after which kpplay gives up.
 MAX_RESETS = 3
+# Options that a page in a browser does not have.
+WINDOW_OPTIONS = ("size", "quality", "target_fps", "path", "frames", "screenshot")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -47,6 +50,9 @@ def main(argv: list[str] | None = None) -> int:
 
 def _command(argv: list[str]) -> None:
     options = _parser().parse_args(argv)
+    if options.web:
+        _play_in_browser(options)
+        return
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames} is not positive")
     Path(options.folder).mkdir(parents=True, exist_ok=True)
@@ -66,6 +72,15 @@ def _command(argv: list[str]) -> None:
             preferences.save(last_settings, file)
         except OSError as error:
             print(f"kpplay: settings were not saved: {file}: {error.strerror or error}", file=sys.stderr)
+
+
+def _play_in_browser(options: argparse.Namespace) -> None:
+    given = [name for name in WINDOW_OPTIONS if getattr(options, name) is not None]
+    if given:
+        raise UsageError(f"--{given[0].replace('_', '-')}: is for the window; the page has its own, leave out --web")
+    from kpc.player.sharing.web_view import play_in_browser
+
+    play_in_browser(Playlist.named(options.scenes).files)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -115,6 +130,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--frames", type=int, metavar="N", help="exit after N frames; settings are neither read nor saved"
     )
+    parser.add_argument("--web", action="store_true", help="play in the browser of this machine, without a window")
     parser.add_argument("--screenshot", type=cli.output_file(".png"), metavar="PNG", help="save the window at the end")
     return parser
 

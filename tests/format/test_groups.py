@@ -18,9 +18,9 @@ from kpc.format.container.container import Reader
 from kpc.format.container.groups import GroupedScene, GroupInput, Groups, Span, Timeline
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.cpu import reference
+from kpc.player.sharing.file_server import Handler, serving
 from kpc.player.viewpoints import fit_camera, orbit
 from kpc.tools.cli import kpinfo, kpjoin, kprender
-from kpc.tools.cli.serve import Handler, serving
 from kpc.tools.rendering.clean_plate import CleanPlates, matte, motion_colours
 from scenes import tiny_scene, with_appearances
 

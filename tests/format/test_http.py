@@ -18,7 +18,7 @@ from kpc.format.container.http import FIRST_BYTES, HttpSource
 from kpc.format.container.http_address import is_url
 from kpc.format.container.scene_io import SceneReader
 from kpc.format.container.sources import RemoteSource, Source
-from kpc.tools.cli.serve import Handler, Link, serving
+from kpc.player.sharing.file_server import Handler, Link, serving
 from scenes import tiny_scene
 
 DATA = np.random.default_rng(0).integers(0, 256, 400_000, np.uint8).tobytes()

@@ -16,8 +16,8 @@ from kpc.format.common.errors import NetworkError, UnreachableError
 from kpc.format.container import http, http_client
 from kpc.format.container.http import HttpSource
 from kpc.format.container.http_address import Address
+from kpc.player.sharing.file_server import Handler, serving
 from kpc.tools.cli import kpinfo
-from kpc.tools.cli.serve import Handler, serving
 
 DATA = bytes(range(256)) * 300
 

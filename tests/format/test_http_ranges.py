@@ -13,7 +13,7 @@ from kpc.format.common.errors import FormatError, NetworkError, UnreachableError
 from kpc.format.container import http, http_client
 from kpc.format.container.http import FIRST_BYTES, HttpSource
 from kpc.format.container.scene_io import SceneReader
-from kpc.tools.cli.serve import Handler, serving
+from kpc.player.sharing.file_server import Handler, serving
 
 DATA = np.random.default_rng(0).integers(0, 256, 200_000, np.uint8).tobytes()
 

@@ -11,7 +11,7 @@ from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import TIME_PLANES, Scene
 from kpc.player.cpu import reference
-from kpc.tools.cli.serve import serving
+from kpc.player.sharing.file_server import serving
 from partial_scenes import coded, opened
 from scenes import VARIANTS, tiny_scene, with_appearances
 

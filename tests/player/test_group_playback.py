@@ -20,9 +20,9 @@ from kpc.format.container.groups import GroupInput, Groups
 from kpc.format.container.sources import open_source
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.gl.renderer import Renderer
+from kpc.player.sharing.file_server import serving
 from kpc.player.streaming.group_playback import GroupPlayback
 from kpc.player.streaming.prefetch import Playhead
-from kpc.tools.cli.serve import serving
 from scenes import tiny_scene
 
 TIMEOUT_S = 10.0

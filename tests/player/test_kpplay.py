@@ -15,7 +15,7 @@ from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.images import read_image
 from kpc.format.container.container import Reader
-from kpc.tools.cli.serve import Handler, serving
+from kpc.player.sharing.file_server import Handler, serving
 from scenes import tiny_scene, with_appearances
 from x_server import x_server
 

@@ -23,10 +23,10 @@ from kpc.format.scene.scene import Scene
 from kpc.player.cpu.corner_grid import CornerGrid
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import Quality
+from kpc.player.sharing.file_server import Handler, Link, serving
 from kpc.player.streaming import stream as module
 from kpc.player.streaming.prefetch import Playhead
 from kpc.player.streaming.stream import Stream
-from kpc.tools.cli.serve import Handler, Link, serving
 from partial_scenes import coded
 from scenes import VARIANTS, tiny_scene
 

@@ -7,8 +7,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from kpc.player.sharing.file_server import Link, serving
 from kpc.tools.cli import serve
-from kpc.tools.cli.serve import Link, serving
 
 DATA = bytes(range(256)) * 40
 

@@ -1,0 +1,193 @@
+"""Web pages that play scenes: a page for one, or a gallery of several, beside the player that they use.
+
+All addresses in the pages are relative, so that the folder may lie anywhere on any static web host.
+"""
+
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from urllib.parse import quote, urljoin
+
+from kpc.format.common.cli import atomic_write
+from kpc.format.common.errors import UsageError
+from kpc.format.scene.metadata import Metadata
+from kpc.format.scene.scene import Clip
+
+# What a page may load: what lies beside it. The player decodes by WebAssembly in workers that start from blobs.
+POLICY = (
+    "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self' blob:; img-src 'self' data: blob:; "
+    "style-src 'self' 'unsafe-inline'; connect-src 'self'$hosts"
+)
+PLAYER_FILES = ("kpc-player.js", "kpc-worker.js")
+# How pages written by this module are recognised: only they are replaced.
+GENERATOR = '<meta name="generator" content="kpshare">'
+PAGE, POSTER = "index.html", "poster.jpg"
+
+
+@dataclass(frozen=True)
+class SharedScene:
+    """What a page says about a scene.
+
+    Attributes:
+        address: of the .kpc file, relative to the page, or absolute.
+        name: of the file without its suffix, which stands in for a title.
+        metadata: of the file.
+        clip: its frames and their rate.
+        size_bytes: of the file.
+        has_poster: whether a poster lies beside the page.
+    """
+
+    address: str
+    name: str
+    metadata: Metadata
+    clip: Clip
+    size_bytes: int
+    has_poster: bool
+
+    @property
+    def title(self) -> str:
+        """The title of the scene, or the name of its file."""
+        return self.metadata.title or self.name
+
+    @property
+    def facts(self) -> str:
+        """Its length and size in words."""
+        size = f"{self.size_bytes / 1e6:.1f} MB" if self.size_bytes >= 1e6 else f"{self.size_bytes / 1e3:.0f} KB"
+        frames = self.clip.frame_count
+        return f"{frames / self.clip.fps:.1f} s, {size}" if frames > 1 else f"still, {size}"
+
+    @property
+    def description(self) -> str:
+        """Its description, or what can be said of every scene."""
+        given = str(self.metadata.document.get("description", ""))
+        return given or f"A scene to look at from all sides ({self.facts}): drag to turn, scroll to come closer."
+
+
+def scene_page(scene: SharedScene, *, root: str = "", url: str | None = None, hosts: str = "") -> str:
+    """Return the page of a scene.
+
+    Args:
+        scene: what it shows.
+        root: where the player and the style sheet lie, relative to the page; the gallery, too, if it is not empty.
+        url: where the page will be published, for link previews, which need whole addresses; None if it is not known.
+        hosts: what else the page may load from, for the Content-Security-Policy.
+    """
+    about = [f"<p>{escape(scene.description)}</p>"]
+    document = scene.metadata.document
+    if credit := [str(document[key]) for key in ("author", "licence", "date") if document.get(key)]:
+        about.append(f"<p>{escape(', '.join(credit))}</p>")
+    return _filled(
+        "scene.html",
+        policy=Template(POLICY).substitute(hosts=escape(hosts)),
+        title=escape(scene.title),
+        description=escape(scene.description),
+        preview=_preview(POSTER if scene.has_poster else None, url),
+        root=root,
+        scene=escape(scene.address),
+        poster=f' poster="{POSTER}"' if scene.has_poster else "",
+        about="\n".join(about),
+        back=f'<p><a href="{root}{PAGE}">All scenes</a></p>' if root else "",
+    )
+
+
+def gallery_page(scenes: Mapping[str, SharedScene], title: str, url: str | None = None) -> str:
+    """Return a page that lists scenes with their posters.
+
+    Args:
+        scenes: by the name of the folder of each one's page.
+        title: of the gallery.
+        url: where the page will be published, for link previews; None if it is not known.
+    """
+    cards, first_poster = [], None
+    for folder, scene in scenes.items():
+        place = quote(folder)
+        image = f'<img src="{place}/{POSTER}" alt="" loading="lazy">' if scene.has_poster else ""
+        first_poster = first_poster or (f"{place}/{POSTER}" if scene.has_poster else None)
+        cards.append(f'<li><a href="{place}/{PAGE}">{image}<h2>{escape(scene.title)}</h2><p>{scene.facts}</p></a></li>')
+    count = f"{len(scenes)} scene{'s' * (len(scenes) != 1)} to look at from all sides."
+    return _filled(
+        "gallery.html",
+        policy=Template(POLICY).substitute(hosts=""),
+        title=escape(title),
+        description=count,
+        preview=_preview(first_poster, url),
+        cards="\n".join(cards),
+    )
+
+
+def embed_snippet(scene: SharedScene, root: str = "", url: str | None = None) -> str:
+    """Return the HTML that shows a scene within another page."""
+    base = url or ""
+    poster = f' poster="{escape(urljoin(base, POSTER))}"' if scene.has_poster else ""
+    return (
+        f'<script type="module" src="{escape(urljoin(base, root + PLAYER_FILES[0]))}"></script>\n'
+        f'<kpc-player src="{escape(urljoin(base, scene.address))}"{poster} controls></kpc-player>'
+    )
+
+
+def copy_player(folder: Path) -> None:
+    """Put the player and the style sheet of the pages into a folder."""
+    built = files("kpc.player") / "web" / "dist"
+    for name in PLAYER_FILES:
+        write_file(folder / name, (built / name).read_bytes())
+    write_file(folder / "page.css", (files(__package__) / "page.css").read_bytes())
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder in which another page than one of this module would be replaced."""
+    page = folder / PAGE
+    if page.exists() and GENERATOR not in page.read_text(errors="replace"):
+        raise UsageError(f"{page}: is not a page of kpshare and stays; choose another folder with -o")
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file of a site, whole or not at all."""
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def copy_scene(source: Path, target: Path) -> None:
+    """Copy a .kpc file, whole or not at all; a file that lies there already stays."""
+    if target.exists() and target.samefile(source):
+        return
+    with atomic_write(target) as temporary:
+        shutil.copyfile(source, temporary)
+
+
+def file_name(name: str) -> str:
+    """Return a name like this one that every web host can serve: letters, digits, dots, dashes and underlines."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "scene"
+
+
+def distinct_names(names: Sequence[str]) -> list[str]:
+    """Return names for files or folders of a site, none of which differs from another by capitals alone."""
+    taken: set[str] = set()
+    found = []
+    for name in map(file_name, names):
+        candidate, number = name, 1
+        while candidate.lower() in taken:
+            number += 1
+            candidate = f"{name}-{number}"
+        taken.add(candidate.lower())
+        found.append(candidate)
+    return found
+
+
+def _preview(poster: str | None, url: str | None) -> str:
+    """Return the elements of a link preview that need whole addresses, or relative ones where none is known."""
+    lines = []
+    if url is not None:
+        lines += [f'<link rel="canonical" href="{escape(url)}">', f'<meta property="og:url" content="{escape(url)}">']
+    if poster is not None:
+        lines.append(f'<meta property="og:image" content="{escape(urljoin(url or "", poster))}">')
+        lines.append('<meta name="twitter:card" content="summary_large_image">')
+    return "\n".join(lines)
+
+
+def _filled(template: str, **values: str) -> str:
+    return Template((files(__package__) / template).read_text()).substitute(values)

@@ -1,0 +1,85 @@
+"""Playing scenes in the browser of this machine."""
+
+import tempfile
+import threading
+import webbrowser
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+from urllib.parse import urlsplit
+
+from kpc.format.container.groups import Groups
+from kpc.format.container.http_address import is_url
+from kpc.player.sharing import site
+from kpc.player.sharing.file_server import Handler, serving
+from kpc.player.sharing.site import SharedScene
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+class _Handler(Handler):
+    """Serves a folder and, by other names, files that lie elsewhere; to pages of its own alone."""
+
+    is_shared = False
+    elsewhere: ClassVar[Mapping[str, Path]] = {}
+
+    def translate_path(self, path: str) -> str:
+        """Return the file that a request means."""
+        found = self.elsewhere.get(urlsplit(path).path)
+        return super().translate_path(path) if found is None else str(found)
+
+
+def play_in_browser(files: Sequence[str]) -> None:
+    """Serve a page that plays scenes, open it in the browser, and go on serving until Ctrl-C.
+
+    Args:
+        files: paths and addresses of .kpc files; several are listed by a gallery.
+
+    Raises:
+        OSError, FormatError, NetworkError: a file cannot be read.
+    """
+    with serving_pages(files) as url:
+        is_open = webbrowser.open(url)
+        print(f"{url} {'is open in' if is_open else 'opens in'} a browser; Ctrl-C ends the server", flush=True)
+        threading.Event().wait()
+
+
+@contextmanager
+def serving_pages(files: Sequence[str]) -> "Iterator[str]":
+    """Serve pages that play scenes to this machine while the context lasts.
+
+    Yields:
+        The URL of the first page.
+    """
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kpplay-")))
+        elsewhere = _write_pages(files, folder)
+        handler = type("_Pages", (_Handler,), {"elsewhere": elsewhere})
+        yield stack.enter_context(serving(folder, handler=handler)) + "/"
+
+
+def _write_pages(files: Sequence[str], folder: Path) -> dict[str, Path]:
+    """Write a page for each scene and, for several, a gallery; return where the files are that the pages name."""
+    site.copy_player(folder)
+    elsewhere: dict[str, Path] = {}
+    names = site.distinct_names([Path(urlsplit(file).path if is_url(file) else file).stem for file in files])
+    is_gallery = len(files) > 1
+    scenes = {}
+    for file, name in zip(files, names, strict=True):
+        groups = Groups(file)
+        prefix = f"{name}/" if is_gallery else ""
+        address, hosts = f"{name}.kpc", ""
+        if is_url(file):
+            address, hosts = file, f" {urlsplit(file).scheme}://{urlsplit(file).netloc}"
+        else:
+            elsewhere[f"/{prefix}{address}"] = Path(file).absolute()
+        scene = SharedScene(address, name, groups.metadata(), groups.clip, sum(groups.size_bytes), has_poster=False)
+        (folder / prefix).mkdir(exist_ok=True)
+        page = site.scene_page(scene, root="../" if is_gallery else "", hosts=hosts)
+        site.write_file(folder / prefix / site.PAGE, page)
+        scenes[name] = scene
+    if is_gallery:
+        site.write_file(folder / site.PAGE, site.gallery_page(scenes, "kpplay"))
+    return elsewhere

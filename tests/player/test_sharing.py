@@ -1,0 +1,185 @@
+"""Pages that play scenes: those of kpshare, and those of kpplay --web."""
+
+import re
+import shutil
+import urllib.request
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from kpc.format.scene.metadata import Metadata
+from kpc.format.scene.scene import Clip
+from kpc.player.app import kpplay
+from kpc.player.sharing import site
+from kpc.player.sharing.site import SharedScene
+from kpc.player.sharing.web_view import serving_pages
+from kpc.tools.cli import kpshare
+
+SAMPLE = Path(__file__).parent.parent.parent / "samples" / "default.kpc"
+HOSTILE = '"><script>alert(1)</script>&'
+
+
+class Page(HTMLParser):
+    """The elements and addresses of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+
+    def addresses(self) -> list[str]:
+        return [value for _, name, value in self.attributes if name in ("src", "href", "poster")]
+
+    def content(self, name: str) -> str:
+        """Return what a `meta` element of this name says."""
+        place = next(i for i, (_, _, value) in enumerate(self.attributes) if value == name)
+        return next(value for _, key, value in self.attributes[place:] if key == "content")
+
+
+def shared(**members: str) -> SharedScene:
+    return SharedScene("scene.kpc", "scene", Metadata(members), Clip(30, 12.0), 57_243, has_poster=True)
+
+
+@pytest.fixture
+def quick_posters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make posters small: how they are rendered is tested by itself."""
+    monkeypatch.setattr("kpc.tools.rendering.poster.SIDE", 16)
+    monkeypatch.setattr("kpc.tools.rendering.poster.SLOW_SIDE", 16)
+
+
+def test_a_page_says_what_the_file_says() -> None:
+    page = Page(site.scene_page(shared(title="A vase", description="It stands.", author="A", licence="CC0")))
+    assert page.content("og:title") == "A vase" and page.content("description") == "It stands."
+    assert ("kpc-player", "src", "scene.kpc") in page.attributes
+    assert page.content("og:image") == "poster.jpg"
+    assert "57 KB" in Page(site.scene_page(shared())).content("description")
+
+
+def test_texts_of_a_file_are_never_markup() -> None:
+    hostile = shared(title=HOSTILE, description=HOSTILE, author=HOSTILE, licence="${title}")
+    plain, attacked = Page(site.scene_page(shared(author="A"))), Page(site.scene_page(hostile))
+    assert attacked.tags == plain.tags and attacked.content("og:title") == HOSTILE
+    assert Page(site.gallery_page({"a": hostile}, HOSTILE)).tags == Page(site.gallery_page({"a": shared()}, "g")).tags
+
+
+def test_a_published_address_makes_link_previews_whole() -> None:
+    page = Page(site.scene_page(shared(), url="https://host.example/a/"))
+    assert page.content("og:image") == "https://host.example/a/poster.jpg"
+    snippet = site.embed_snippet(shared(), url="https://host.example/a/")
+    assert 'src="https://host.example/a/kpc-player.js"' in snippet
+
+
+@pytest.mark.parametrize(
+    ("names", "wanted"),
+    [
+        (["a", "A", "b"], ["a", "A-2", "b"]),
+        (["zwei Köpfe", "..", "con/../x"], ["zwei-K-pfe", "scene", "con-..-x"]),
+        (["a", "a", "a-2"], ["a", "a-2", "a-2-2"]),
+    ],
+)
+def test_names_suit_every_host(names: list[str], wanted: list[str]) -> None:
+    assert site.distinct_names(names) == wanted
+
+
+def test_one_scene_becomes_one_page(tmp_path: Path, quick_posters: None, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "made" / "site"
+    assert kpshare.main([str(SAMPLE), "-o", str(folder)]) == 0
+    assert "<kpc-player" in capsys.readouterr().out
+    found = sorted(path.name for path in folder.iterdir())
+    assert found == ["default.kpc", "index.html", "kpc-player.js", "kpc-worker.js", "page.css", "poster.jpg"]
+    assert (folder / "default.kpc").read_bytes() == SAMPLE.read_bytes()
+    page = Page((folder / "index.html").read_text())
+    assert all((folder / address).is_file() for address in page.addresses())
+    assert kpshare.main([str(SAMPLE), "-o", str(folder)]) == 0, "a site can be made anew"
+
+
+def test_several_scenes_become_a_gallery(tmp_path: Path, quick_posters: None) -> None:
+    scenes, folder = tmp_path / "my scenes", tmp_path / "site"
+    scenes.mkdir()
+    for name in ("one.kpc", "two 2.kpc"):
+        shutil.copy(SAMPLE, scenes / name)
+    assert kpshare.main(["--gallery", str(scenes), "-o", str(folder)]) == 0
+    gallery = Page((folder / "index.html").read_text())
+    assert gallery.tags.count("img") == 2 and gallery.content("og:title") == "my scenes"
+    pages = [address for address in gallery.addresses() if address.endswith("index.html")]
+    assert pages == ["one/index.html", "two-2/index.html"]
+    for page in (folder / address for address in pages):
+        assert all((page.parent / address).is_file() for address in Page(page.read_text()).addresses())
+
+
+def test_the_page_of_someone_else_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "index.html").write_text("<h1>mine</h1>")
+    assert kpshare.main([str(SAMPLE), "-o", str(tmp_path)]) == 2
+    assert "is not a page of kpshare" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["index.html"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ([], "no scene is given"),
+        (["--gallery", "missing"], "no such folder"),
+        ([str(SAMPLE), "--title", "A"], "kpedit --title"),
+        ([str(SAMPLE), "--url", "host/a"], "no address"),
+        (["https://host/a.kpc"], "download"),
+    ],
+)
+def test_what_cannot_be_shared_is_refused(
+    arguments: list[str], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = kpshare.main([*arguments, "-o", str(tmp_path / "site")])
+    except SystemExit as end:
+        code = end.code
+    assert code == 2 and reason in capsys.readouterr().err and not (tmp_path / "site").exists()
+
+
+def test_what_is_no_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.kpc").write_bytes(b"no scene")
+    assert kpshare.main([str(tmp_path / "a.kpc"), "-o", str(tmp_path / "site")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def read(url: str, **headers: str) -> tuple[bytes, dict[str, str]]:
+    with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as answer:
+        return answer.read(), {name.lower(): value for name, value in answer.headers.items()}
+
+
+def test_a_browser_gets_page_player_and_scene(tmp_path: Path) -> None:
+    scene = tmp_path / "a b.kpc"
+    shutil.copy(SAMPLE, scene)
+    with serving_pages([str(scene)]) as url:
+        page, headers = read(url)
+        assert headers["content-type"].startswith("text/html") and "access-control-allow-origin" not in headers
+        addresses = Page(page.decode()).addresses()
+        types = {address: read(url + address)[1]["content-type"] for address in addresses}
+        assert "javascript" in types["kpc-player.js"] and "text/css" in types["page.css"]
+        part, headers = read(url + "a-b.kpc", Range="bytes=4-9")
+        assert part == SAMPLE.read_bytes()[4:10] and headers["content-range"] == f"bytes 4-9/{SAMPLE.stat().st_size}"
+
+
+def test_a_scene_elsewhere_may_be_loaded_from_there_alone(tmp_path: Path) -> None:
+    with serving_pages([str(SAMPLE)]) as host:
+        with serving_pages([f"{host}default.kpc", str(SAMPLE)]) as url:
+            gallery = Page(read(url)[0].decode())
+            page = Page(read(url + "default/")[0].decode())
+            assert ("kpc-player", "src", f"{host}default.kpc") in page.attributes
+            policy = page.content("Content-Security-Policy")
+            assert policy.endswith(f"connect-src 'self' {host.rstrip('/')}")
+            assert [a for a in gallery.addresses() if "default" in a] == ["default/index.html", "default-2/index.html"]
+
+
+def test_options_of_the_window_are_refused_for_a_page(capsys: pytest.CaptureFixture[str]) -> None:
+    assert kpplay.main(["--web", str(SAMPLE), "--frames", "3"]) == 2
+    assert "--frames" in capsys.readouterr().err
+
+
+def test_no_page_loads_from_elsewhere() -> None:
+    for page in (site.scene_page(shared()), site.gallery_page({"a": shared()}, "g")):
+        assert not re.findall(r"https?://", page)

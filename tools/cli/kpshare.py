@@ -1,0 +1,118 @@
+"""kpshare: make a folder for any web host, with pages that play scenes.
+
+    kpshare scene.kpc -o site/                          a page that plays the scene
+    kpshare scene.kpc -o site/ --url https://host/a/    link previews and the snippet have whole addresses
+    kpshare one.kpc two.kpc -o site/                    a gallery, and a page for each scene
+    kpshare --gallery scenes/ -o site/                  the same, of all scenes of a folder
+
+Nothing needs to run on the host, and nothing is loaded from elsewhere. `kpplay --web scene.kpc` shows a scene in a
+browser on this machine.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+from urllib.parse import urljoin, urlsplit
+
+import kpc
+from kpc.format.common import cli
+from kpc.format.common.errors import UsageError
+from kpc.format.common.images import write_image
+from kpc.format.common.progress import progress
+from kpc.player.app.playlist import Playlist
+from kpc.player.sharing import site
+from kpc.player.sharing.site import SharedScene
+from kpc.tools.rendering.poster import render_poster
+
+# Of JPEG: posters are seen for a second, and are to be no larger than scenes.
+POSTER_QUALITY = 80
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    return cli.run(_command, "kpshare", argv)
+
+
+def _command(argv: list[str]) -> None:
+    options = _parser().parse_args(argv)
+    files = [Path(name) for name in Playlist.named([str(path) for path in _inputs(options)]).files]
+    is_gallery = options.gallery is not None or len(files) > 1
+    folder = options.output
+    site.check_folder(folder)
+    names = site.distinct_names([file.stem for file in files])
+    folders = [folder / name if is_gallery else folder for name in names]
+    for one in folders if is_gallery else ():
+        site.check_folder(one)
+    folder.mkdir(parents=True, exist_ok=True)
+    site.copy_player(folder)
+    root = "../" if is_gallery else ""
+    scenes: dict[str, SharedScene] = {}
+    for file, name, place in progress(list(zip(files, names, folders, strict=True)), "kpshare", unit="scenes"):
+        place.mkdir(exist_ok=True)
+        scenes[name] = _share(file, name, place)
+        url = None if options.url is None else urljoin(options.url, f"{name}/" if is_gallery else "")
+        site.write_file(place / site.PAGE, site.scene_page(scenes[name], root=root, url=url))
+    if is_gallery:
+        title = options.title or (options.gallery or folder).absolute().name
+        site.write_file(folder / site.PAGE, site.gallery_page(scenes, title, options.url))
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    print(
+        f"{folder / site.PAGE}: {len(files)} scene{'s' * (len(files) != 1)}, {size:,} bytes; put {folder} on a web host"
+    )
+    if not is_gallery:
+        print("\nTo show it within another page:\n" + site.embed_snippet(scenes[names[0]], url=options.url))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="kpshare", description="Make a folder for any web host, with pages that play scenes."
+    )
+    cli.add_version_option(parser)
+    parser.add_argument(
+        "scenes", nargs="*", type=cli.input_path, metavar="scene", help=".kpc files, or folders of them"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="the folder to write; it is made"
+    )
+    parser.add_argument(
+        "--gallery", type=cli.input_path, metavar="DIR", help="a page that lists all scenes of this folder"
+    )
+    parser.add_argument("--title", metavar="TEXT", help="title of the gallery (default: the name of the folder)")
+    parser.add_argument(
+        "--url", type=_url, metavar="URL", help="where the folder will be published, for link previews of social media"
+    )
+    return parser
+
+
+def _inputs(options: argparse.Namespace) -> list[Path]:
+    if options.gallery is not None and not options.gallery.is_dir():
+        raise UsageError(f"--gallery {options.gallery}: no such folder")
+    inputs = [*options.scenes, *([] if options.gallery is None else [options.gallery])]
+    if not inputs:
+        raise UsageError("no scene is given; name a .kpc file, or a folder of them with --gallery")
+    if options.output.exists() and not options.output.is_dir():
+        raise UsageError(f"-o {options.output}: is a file; give a folder")
+    if options.title is not None and options.gallery is None and len(inputs) == 1 and not inputs[0].is_dir():
+        raise UsageError("--title: a page of one scene has the scene's own title, which kpedit --title sets")
+    return inputs
+
+
+def _share(file: Path, name: str, folder: Path) -> SharedScene:
+    """Put a scene and its poster into the folder of its page."""
+    loaded = kpc.load(file)
+    scene, _ = loaded.at(0.0)
+    write_image(folder / site.POSTER, render_poster(loaded), POSTER_QUALITY)
+    address = f"{name}.kpc"
+    site.copy_scene(file, folder / address)
+    return SharedScene(address, file.stem, scene.metadata, loaded.clip, file.stat().st_size, has_poster=True)
+
+
+def _url(text: str) -> str:
+    parts = urlsplit(text)
+    if parts.scheme not in ("http", "https") or not parts.netloc:
+        raise argparse.ArgumentTypeError(f"{text!r} is no address of a web page, such as https://example.org/scene/")
+    return text if text.endswith("/") else text + "/"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
