@@ -34,7 +34,8 @@ class Page(HTMLParser):
         self.attributes += [(tag, name, value or "") for name, value in attrs]
 
     def addresses(self) -> list[str]:
-        return [value for _, name, value in self.attributes if name in ("src", "href", "poster")]
+        found = [value for _, name, value in self.attributes if name in ("src", "href", "poster")]
+        return [address for address in found if not address.startswith("data:")]
 
     def content(self, name: str) -> str:
         """Return what a `meta` element of this name says."""
