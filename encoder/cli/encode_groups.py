@@ -20,6 +20,7 @@ from kpc.encoder.cli.metadata import clip_metadata, hash_dataset
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import Setting, prepare_setting, trim_with_progress
 from kpc.encoder.cli.report import log
+from kpc.encoder.cli.sound import sound_of_span
 from kpc.encoder.cli.transcode import combine_figures
 from kpc.encoder.cli.work_folder import clear_work_folder
 from kpc.encoder.rdo.codec_model import load_checkpoint
@@ -91,7 +92,8 @@ def group_path(work: Path, number: int) -> Path:
 
 def setting_of_span(setting: Setting, span: groups.Span) -> Setting:
     """Return the setting for the frames of one group."""
-    return replace(setting, dataset=setting.dataset.frame_range(span.start, span.last))
+    dataset, clip = setting.dataset.frame_range(span.start, span.last), setting.dataset.clip
+    return replace(setting, dataset=dataset, sound=sound_of_span(setting.sound, span, clip.fps))
 
 
 def _trim_for_groups(setting: Setting, options: Options, spans: Sequence[groups.Span]) -> Setting:

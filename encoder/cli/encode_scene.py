@@ -63,8 +63,9 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     if trainer.config.summed:
         return _evaluate_unwritable(trainer, options, started)
     scene, pictures = to_scene(trainer), _select_cameras(dataset)
-    metadata = describe(options, dataset, scene, pictures, setting.dataset_sha256 or hash_dataset(dataset))
-    scene = replace(scene, metadata=metadata)
+    described = replace(options, audio=setting.sound_from)
+    metadata = describe(described, dataset, scene, pictures, setting.dataset_sha256 or hash_dataset(dataset))
+    scene = replace(scene, metadata=metadata, sound=setting.sound)
     coding_from_s = working_s()
     coded = _code(trainer, scene, reserve_figures(options))
     coding_s = working_s() - coding_from_s
@@ -92,6 +93,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         "space": SPACES[type(trainer.mapping)][0],
         "appearance": trainer.config.appearance,
         "appearances": len(trainer.names),
+        "sound": None if setting.sound is None else setting.sound_from,
         **figures,
         **coding_figures(coded, size, options.trade, "training views"),
         "steps": trainer.step,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from kpc.encoder.coding.opus import BITRATES, DEFAULT_BITRATES
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation.ablations import ABLATIONS, BASELINE
 from kpc.encoder.evaluation.testing_time import FEWEST_PICTURES
@@ -45,6 +46,8 @@ class Options:
         members: of the file's metadata: title, description, author, licence and date.
         view_limits: "auto", "none", or members of the view limits (`kpc.format.container.metadata_options`); None for
             "auto", or where nothing is trained for those of the source.
+        audio: "auto", "none", a camera or a file.
+        audio_bitrate: of its sound, bits per second; None for a default.
         ablation: one of `kpc.encoder.evaluation.ablations`; not an option of the command line.
     """
 
@@ -75,6 +78,8 @@ class Options:
     preview: Path | None = None
     members: Mapping[str, str] = field(default_factory=dict)
     view_limits: str | Mapping[str, Any] | None = None
+    audio: str = "auto"
+    audio_bitrate: int | None = None
     ablation: str = BASELINE
 
     @property
@@ -129,6 +134,7 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     parser.add_argument("-o", "--output", type=Path, help="the .kpc file to write")
     _add_training_options(parser)
     _add_dataset_options(parser)
+    _add_sound_options(parser)
     _add_run_options(parser)
     _add_coding_options(parser)
     add_metadata_options(parser)
@@ -206,6 +212,25 @@ def _add_dataset_options(parser: argparse.ArgumentParser) -> None:
         default=Options.appearance,
         help="learn an appearance embedding for each camera or each image: unequal exposure, white balance, weather; "
         "auto: image for photographs by many lenses, else none (default: %(default)s)",
+    )
+
+
+def _add_sound_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--audio",
+        default=Options.audio,
+        metavar="auto|none|NAME|FILE",
+        help="the sound of the clip: the clearest track of its videos, none, the track of a camera, or a sound file "
+        "that begins with the videos or, beside images, with the first frame (default: %(default)s)",
+    )
+    low, high = BITRATES
+    mono, stereo = DEFAULT_BITRATES.values()
+    parser.add_argument(
+        "--audio-bitrate",
+        type=_bitrate,
+        metavar="48k",
+        help=f"bits per second of the sound, {low // 1000}k to {high // 1000}k (default: {mono // 1000}k for mono, "
+        f"{stereo // 1000}k for stereo)",
     )
 
 
@@ -337,6 +362,8 @@ def _options_from(given: argparse.Namespace) -> Options:
         preview=given.output.with_name(given.output.name + ".preview.png") if given.preview else None,
         members=members_from(given),
         view_limits=given.view_limits,
+        audio=given.audio,
+        audio_bitrate=given.audio_bitrate,
     )
 
 
@@ -364,6 +391,14 @@ def _quality(text: str) -> float:
 
 def _lam(text: str) -> float:
     return cli.number_within(text, 1e-4, 1e6)
+
+
+def _bitrate(text: str) -> int:
+    number = text.lower().removesuffix("k")
+    value = int(number) * (1000 if number != text.lower() else 1)
+    if not BITRATES[0] <= value <= BITRATES[1]:
+        raise argparse.ArgumentTypeError(f"{text} is not between {BITRATES[0] // 1000}k and {BITRATES[1] // 1000}k")
+    return value
 
 
 def _seed(text: str) -> int:

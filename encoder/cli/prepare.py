@@ -7,6 +7,7 @@ import numpy as np
 from kpc.encoder.cli.grouped import initialise_from
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.report import SPACES, describe_model, describe_time_rows, log, show_progress
+from kpc.encoder.cli.sound import find_sound
 from kpc.encoder.cli.transcode import check_outputs
 from kpc.encoder.cli.work_folder import CHECKPOINT, choose_device, make_work_folder, remove_if_empty
 from kpc.encoder.datasets import Dataset, load_dataset
@@ -28,6 +29,7 @@ from kpc.format.common.errors import DatasetError, UsageError
 from kpc.format.common.progress import Progress
 from kpc.format.container import scene_layout
 from kpc.format.scene.scene import Scene
+from kpc.format.scene.sound import Sound
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
 
 
@@ -42,6 +44,8 @@ class Setting:
         is_final: whether the box is not to be trimmed any more.
         before: the scene to start from, whose last picture is about the first of this dataset; None to start afresh.
         dataset_sha256: of the dataset of which this is a part; None if it is a whole.
+        sound: of the clip; None if it is silent.
+        sound_from: the track that it is from, as --audio names it.
     """
 
     dataset: Dataset
@@ -50,6 +54,8 @@ class Setting:
     is_final: bool
     before: Scene | None = None
     dataset_sha256: str | None = None
+    sound: Sound | None = None
+    sound_from: str = Options.audio
 
 
 def prepare_setting(options: Options) -> Setting:
@@ -65,6 +71,7 @@ def prepare_setting(options: Options) -> Setting:
     try:
         dataset = load_dataset(options.source, options.work_dir, holdout=options.holdout, downscale=options.downscale)
         aabb, mapping, why = _find_space(dataset, options)
+        sound, sound_from = find_sound(options, dataset)
     except BaseException:
         remove_if_empty(options.work_dir)
         raise
@@ -72,7 +79,8 @@ def prepare_setting(options: Options) -> Setting:
     for doubt in doubts(dataset):
         log(f"warning: {doubt}")
     log(f"space: {SPACES[type(mapping)][1]} ({why})")
-    return Setting(dataset, aabb, mapping, options.box is not None or isinstance(mapping, Contraction))
+    is_final = options.box is not None or isinstance(mapping, Contraction)
+    return Setting(dataset, aabb, mapping, is_final, sound=sound, sound_from=sound_from)
 
 
 def prepare_trainer(options: Options, setting: Setting) -> Trainer:

@@ -75,6 +75,7 @@ class Dataset:
         camera_names: by the numbers in `pictures.camera`.
         masks: which pixels may be used; None if all may.
         left_out: how many images or videos in the folders that were read are not used.
+        video_start_s: when the whole clip begins, in the seconds of the videos; None if the pictures are images.
     """
 
     layout: str
@@ -87,6 +88,7 @@ class Dataset:
     camera_names: tuple[str, ...]
     masks: Masks | None = None
     left_out: int = 0
+    video_start_s: float | None = None
 
     @property
     def is_monocular(self) -> bool:

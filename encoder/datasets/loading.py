@@ -124,7 +124,7 @@ def _load(
     root: Path, capture: Capture, mask_files: list[MaskFile | None], cache_dir: Path, downscale: int, progress: bool
 ) -> Dataset:
     views = capture.views
-    frames, times, clip = _times(root, capture)
+    frames, times, clip, video_start_s = _times(root, capture)
     view_of = np.repeat(np.arange(len(views)), [len(some) for some in frames])  # the view of each picture
     key = hashlib.sha256(os.fsencode(f"{root.resolve()} {downscale}")).hexdigest()[:12]
     cache = _cached_pixels(root, views, frames, cache_dir / f"pixels-{key}.bin", downscale, progress)
@@ -154,11 +154,23 @@ def _load(
             f"{root}: its masks ignore every pixel to train on (0 means ignored); invert the masks or remove them"
         )
     is_dynamic = clip.frame_count > 1
-    return Dataset(capture.layout, root, pictures, cache, clip, is_dynamic, cache.channels == 4, names, masks)
+    return Dataset(
+        capture.layout,
+        root,
+        pictures,
+        cache,
+        clip,
+        is_dynamic,
+        cache.channels == 4,
+        names,
+        masks,
+        video_start_s=video_start_s,
+    )
 
 
-def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray, Clip]:
-    """Return the frames of each view that are used, the time of each of these pictures in [0, 1], and the clip.
+def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray, Clip, float | None]:
+    """Return the frames of each view that are used, the time of each of these pictures in [0, 1], the clip, and when it
+    begins in the seconds of the videos; None for images.
 
     Videos are aligned by `timeline.align`. The time of an image is the dataset's if all are within [0, 1], else shifted
     and scaled to [0, 1]; the frame count of their clip follows from the median step between times of training images.
@@ -167,11 +179,11 @@ def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray,
     if videos:
         _report_notes(root, videos)
         timeline = align(root, videos)
-        return timeline.frames, np.concatenate(timeline.times), timeline.clip
+        return timeline.frames, np.concatenate(timeline.times), timeline.clip, timeline.start_s
     still = (range(1),) * len(capture.views)
     given = [view.time for view in capture.views]
     if all(time is None for time in given):
-        return still, np.zeros(len(given)), Clip(1, ASSUMED_FPS)
+        return still, np.zeros(len(given)), Clip(1, ASSUMED_FPS), None
     if any(time is None or not math.isfinite(time) for time in given):
         number = next(k for k, time in enumerate(given) if time is None or not math.isfinite(time))
         name = capture.views[number].file.name
@@ -185,7 +197,7 @@ def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray,
         times = (times - low) / (high - low) if high > low else np.zeros_like(times)
     steps = np.diff(np.unique(np.round(times[[not view.is_test for view in capture.views]], 6)))
     count = min(1 + round(1 / float(np.median(steps))), len(times)) if len(steps) else 1
-    return still, times, Clip(count, float(capture.fps or ASSUMED_FPS))
+    return still, times, Clip(count, float(capture.fps or ASSUMED_FPS)), None
 
 
 def _report_notes(root: Path, videos: dict[str, VideoInfo]) -> None:

@@ -38,11 +38,13 @@ class Timeline:
         clip: the time axis.
         frames: of each video, the numbers of the frames that are used.
         times: of each video, the times of these frames in [0, 1], float64.
+        start_s: when the clip begins, in the seconds of the videos.
     """
 
     clip: Clip
     frames: tuple[range, ...]
     times: tuple[np.ndarray, ...]
+    start_s: float
 
 
 def align(root: Path, videos: Mapping[str, VideoInfo]) -> Timeline:
@@ -81,7 +83,7 @@ def align(root: Path, videos: Mapping[str, VideoInfo]) -> Timeline:
     if line:
         print(f"{root}: {line}", file=sys.stderr)
     times = tuple(p / max(last, 1e-9) for p in positions)
-    return Timeline(Clip(round(float(last)) + 1, fps), tuple(frames), times)
+    return Timeline(Clip(round(float(last)) + 1, fps), tuple(frames), times, float(start))
 
 
 def frame_rate(video: VideoInfo) -> float:

@@ -19,6 +19,7 @@ from kpc.format.common.errors import FormatError, TrainingError
 from kpc.format.container.metadata_chunk import pack_metadata, parse_metadata
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Appearance, Clip, Decoder, HybridDecoder, Scene
+from kpc.format.scene.sound import Sound
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
 
 CHECKPOINT_MAGIC = b"PK"  # PyTorch writes ZIP archives
@@ -49,6 +50,7 @@ def save_checkpoint(path: Path, scene: Scene, validation: ValidationRays) -> Non
         "metadata": pack_metadata(scene.metadata).decode(),
         "names": [appearance.name for appearance in scene.appearances],
         "codes": [appearance.code for appearance in scene.appearances],
+        "sound": _sound_to_dict(scene.sound),
         "validation_rays": vars(validation),
     }
     state = _map_values(state, np.ndarray, lambda a: torch.from_numpy(np.ascontiguousarray(a)))
@@ -105,7 +107,25 @@ def _scene_from_state(state: Mapping[str, Any]) -> Scene:
         state["motion"],
         tuple(Appearance(name, code) for name, code in zip(state["names"], state["codes"], strict=True)),
         parse_metadata(state.get("metadata", "{}").encode()),
+        _sound_from_dict(state.get("sound")),
     )
+
+
+def _sound_to_dict(sound: Sound | None) -> dict[str, Any] | None:
+    if sound is None:
+        return None
+    lengths = np.array([len(packet) for packet in sound.packets], np.int64)
+    packets = np.frombuffer(bytearray().join(sound.packets), np.uint8)
+    head = {name: getattr(sound, name) for name in ("channels", "pre_skip", "sample_count")}
+    return {**head, "lengths": lengths, "packets": packets}
+
+
+def _sound_from_dict(state: Mapping[str, Any] | None) -> Sound | None:
+    if state is None:
+        return None
+    ends, content = np.cumsum(state["lengths"]).tolist(), state["packets"].tobytes()
+    packets = tuple(content[start:end] for start, end in zip([0, *ends], ends, strict=False))
+    return Sound(state["channels"], state["pre_skip"], state["sample_count"], packets)
 
 
 def _check(scene: Scene, rays: ValidationRays) -> None:

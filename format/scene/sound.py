@@ -12,13 +12,13 @@ from itertools import accumulate
 from kpc.format.common.errors import FormatError
 
 SAMPLE_RATE = 48000  # of the decoder's output, samples per second and channel
-PRE_ROLL = 3840  # samples, 80 ms, that a decoder decodes before its output is that of a decoder which began earlier
+# Samples, 160 ms, that a decoder decodes before its output is that of a decoder which began earlier, to -46 dB; the
+# error halves with each packet of 20 ms.
+PRE_ROLL = 7680
 PACKET_SAMPLES_LIMIT = 5760  # samples of a packet, 120 ms
 
-_SILK, _CELT = (
-    (480, 960, 1920, 2880),
-    (120, 240, 480, 960),
-)  # samples of a frame by the lowest bits of its configuration
+# Samples of a frame by the lowest two bits of its configuration.
+_SILK, _CELT = (480, 960, 1920, 2880), (120, 240, 480, 960)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import { FormatError } from './errors.js';
 
 export const SAMPLE_RATE = 48000;
 /** Samples that a decoder must decode before its output is that of one which began earlier. */
-export const PRE_ROLL = 3840;
+export const PRE_ROLL = 7680;
 /** SOUND_LIMIT and DURATION_LIMIT of section 11.1. */
 export const SOUND_LIMIT = 1 << 20;
 export const DURATION_LIMIT = 480000;

@@ -1,0 +1,105 @@
+"""The sound of an encode: the clearest track of a dataset's videos, the one that is named, or that of a file."""
+
+from pathlib import Path
+
+import numpy as np
+
+from kpc.encoder.cli.options import Options
+from kpc.encoder.cli.report import log
+from kpc.encoder.coding.opus import encode_sound
+from kpc.encoder.datasets import Dataset
+from kpc.encoder.datasets.capture import printable
+from kpc.encoder.datasets.sound_tracks import MEASURED_S, Clarity, clarity, clearest, has_sound, read_samples
+from kpc.format.common.errors import UsageError
+from kpc.format.container.groups import Span
+from kpc.format.scene.sound import SAMPLE_RATE, Sound
+
+
+def find_sound(options: Options, dataset: Dataset) -> tuple[Sound | None, str]:
+    """Return the coded sound of the clip, and the name of the file that it is from; without any, what --audio says.
+
+    None for a static scene, for --audio none, and where no video has a sound.
+
+    Raises:
+        UsageError: there is no track of the name that --audio gives.
+        MediaError: a file cannot be read.
+    """
+    wanted = options.audio
+    if wanted == "none" or (wanted == "auto" and dataset.video_start_s is None):
+        return None, wanted
+    if not dataset.is_dynamic:
+        if wanted == "auto":
+            return None, wanted
+        raise UsageError(f"--audio {wanted}: the scene is static, so nothing can be heard; drop it")
+    files = _videos(dataset)
+    if wanted == "auto":
+        path, why = _clearest(dataset, files)
+    else:
+        path, why = _named(wanted, files), "as given"
+    if path is None:
+        log(f"sound: none ({why})")
+        return None, wanted
+    samples = _samples(dataset, path)
+    if samples is None:
+        raise UsageError(f"--audio {wanted}: {path} has no sound in the {dataset.clip.total_s:.4g} s of the clip")
+    sound = encode_sound(samples, options.audio_bitrate)
+    size = sum(map(len, sound.packets))
+    kind = "mono" if sound.channels == 1 else "stereo"
+    log(
+        f"sound: {printable(path.name)}, {kind}, {sound.duration_s:.4g} s, {size / sound.duration_s:,.0f} bytes a "
+        f"second ({why})"
+    )
+    return sound, path.name
+
+
+def sound_of_span(sound: Sound | None, span: Span, fps: float) -> Sound | None:
+    """Return the sound of some frames of a clip (spec/kpc-format.md, "Groups")."""
+    if sound is None:
+        return None
+    return sound.part(sample_of_frame(span.start, fps), sample_of_frame(span.count, fps))
+
+
+def sample_of_frame(frame: float, fps: float) -> int:
+    """Return the sample that is heard when a frame is first shown."""
+    return int(SAMPLE_RATE * frame / fps + 0.5)
+
+
+def _videos(dataset: Dataset) -> dict[str, Path]:
+    """Return the videos of a dataset by the names of their files; none of images."""
+    if dataset.video_start_s is None:
+        return {}
+    return {name: dataset.path / name for name in dict.fromkeys(dataset.pictures.file)}
+
+
+def _samples(dataset: Dataset, path: Path, most_s: float = float("inf")) -> np.ndarray | None:
+    return read_samples(path, dataset.video_start_s or 0.0, min(dataset.clip.total_s, most_s))
+
+
+def _clearest(dataset: Dataset, files: dict[str, Path]) -> tuple[Path | None, str]:
+    """Return the video with the clearest track, and why."""
+    found: dict[str, Clarity] = {}
+    for name, path in files.items():
+        samples = _samples(dataset, path, MEASURED_S)
+        if samples is not None:
+            found[name] = clarity(samples)
+    best = clearest(found)
+    if best is None:
+        return None, f"the tracks of all {len(found)} videos are silent" if found else "no video has a sound track"
+    one = found[best]
+    level = f"{one.range_db:.0f} dB above its noise floor{', clipped' if one.is_clipped else ''}"
+    among = f"the clearest of {len(found)} tracks, " if len(found) > 1 else "the only track, " if len(files) > 1 else ""
+    return files[best], f"{among}{level}; --audio overrides"
+
+
+def _named(wanted: str, files: dict[str, Path]) -> Path:
+    for name, path in files.items():
+        if wanted in (name, path.name, path.stem):
+            return path
+    path = Path(wanted)
+    if path.is_file():
+        if not has_sound(path):
+            raise UsageError(f"--audio {wanted}: no sound file, nor a video with a sound track")
+        return path
+    known = ", ".join(printable(path.stem) for path in list(files.values())[:4])
+    cameras = f"one of {known}{' ...' if len(files) > 4 else ''}, or " if files else ""
+    raise UsageError(f"--audio {wanted}: neither a camera nor a file; give {cameras}a sound file, auto or none")
