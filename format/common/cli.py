@@ -23,6 +23,9 @@ from kpc.format.common.version import VERSION
 # Packages that only some extras bring, with one that does.
 EXTRAS = {"numba": "cpu", "llvmlite": "cpu", "OpenEXR": "film"}
 
+# Seconds by which a time that was typed may be beyond an end and still mean it: durations are shown in hundredths.
+TIME_SLACK_S = 0.0051
+
 
 def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None = None) -> int:
     """Run a command and turn the exceptions it raises into an exit code and one line on stderr.
@@ -155,6 +158,11 @@ def duration_s(text: str) -> float:
     if not 0 < value < 1e9:
         raise argparse.ArgumentTypeError(f"{text!r} is not a duration; write for example 90s, 10m or 1.5h")
     return value
+
+
+def time_s(text: str) -> float:
+    """Parse a time of a clip such as "1.5", "1.5s" or "2m" into seconds; 0 is one."""
+    return 0.0 if text in ("0", "0s", "0.0") else duration_s(text)
 
 
 def frame_rate(low: float, high: float) -> Callable[[str], float]:

@@ -358,21 +358,36 @@ class GroupInput:
 def group_inputs(files: Sequence[AnySource]) -> list[GroupInput]:
     """Return the groups of all files, as inputs of `write`.
 
-    Files of groups know their frames; if all files do, they are sorted. A scene follows the file before it.
+    Files of groups know their frames; if all files do, they are sorted. What begins with frame 0, as scenes and whole
+    clips do, follows the file before it.
     """
     opened = [Groups(source, in_parts=True) for source in files]
     if not any(groups.is_single for groups in opened):
         opened.sort(key=lambda groups: groups.timeline.spans[0].start)
     parts: list[GroupInput] = []
     for groups in opened:
+        spans = groups.timeline.spans
+        start = parts[-1].span.last + 1 if parts and spans[0].start == 0 else 0
         if groups.is_single:
-            parts.append(GroupInput.of(groups.reader.source, parts[-1].span.last + 1 if parts else 0))
+            parts.append(GroupInput.of(groups.reader.source, start))
         else:
             parts += [
-                GroupInput.of(groups.source_of(number), span.start, groups.metadata())
-                for number, span in enumerate(groups.timeline.spans)
+                GroupInput.of(groups.source_of(number), start + span.start, groups.metadata())
+                for number, span in enumerate(spans)
             ]
     return parts
+
+
+def check_parts(parts: Sequence[GroupInput]) -> None:
+    """Check that the frames of parts make up a clip, see `check_spans`.
+
+    Raises:
+        UsageError: they do not.
+    """
+    try:
+        check_spans([part.span for part in parts], [part.source.name for part in parts])
+    except FormatError as error:
+        raise UsageError(str(error)) from error
 
 
 def write(parts: Sequence[GroupInput], path: str | os.PathLike[str], metadata: Metadata | None = None) -> int:
@@ -388,10 +403,7 @@ def write(parts: Sequence[GroupInput], path: str | os.PathLike[str], metadata: M
     Raises:
         UsageError: the parts do not make up a clip.
     """
-    try:
-        check_spans([part.span for part in parts], [part.source.name for part in parts])
-    except FormatError as error:
-        raise UsageError(str(error)) from error
+    check_parts(parts)
     odd = next((part for part in parts if part.fps != parts[0].fps), None)
     if odd is not None:
         raise UsageError(

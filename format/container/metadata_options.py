@@ -1,6 +1,7 @@
 """Options of commands that set metadata: --title and the like, and --view-limits."""
 
 import argparse
+import datetime
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -55,6 +56,8 @@ def view_limits(text: str) -> str | dict[str, Any]:
             raise argparse.ArgumentTypeError(f"{part!r} is not like azimuth=-30:30") from error
         if name not in LIMITS or name in found or len(numbers) != (1 if name == "reach" else 2):
             raise argparse.ArgumentTypeError(f"{part!r} is not like azimuth=-30:30 or reach=0.2, each at most once")
+        if numbers[0] > numbers[-1]:
+            raise argparse.ArgumentTypeError(f"{part!r}: the least value is above the largest; swap them")
         found[name] = numbers[0] if name == "reach" else numbers
     placeholder = {"focus": [0, 0, 0], "forward": [1, 0, 0], "azimuth": [0, 0], "elevation": [0, 0]}
     limits = {**placeholder, "distance": [1, 1], "reach": 0, **found}
@@ -84,6 +87,8 @@ def _text(name: str) -> Any:
         # Arguments are decoded as the locale says, which may be no more than ASCII; terminals send UTF-8.
         text = os.fsencode(text).decode("utf-8", "replace")
         text = text.replace("\\n", "\n") if name == "description" else text
+        if name == "date" and text:
+            _check_date(text)
         try:
             pack_metadata(Metadata({name: text} if text else {}))
         except FormatError as error:
@@ -92,3 +97,13 @@ def _text(name: str) -> Any:
 
     parse.__name__ = name
     return parse
+
+
+def _check_date(text: str) -> None:
+    whole = text + "-01" * (2 - text.count("-"))
+    try:
+        is_date = datetime.date.fromisoformat(whole).isoformat() == whole
+    except ValueError:
+        is_date = False
+    if not is_date:
+        raise argparse.ArgumentTypeError(f"{text!r} is no date like 2026, 2026-11 or 2026-11-27")

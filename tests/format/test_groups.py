@@ -201,7 +201,11 @@ def test_joined_groups_are_sorted(scenes, tmp_path, capsys):
 def test_scenes_follow_the_file_before_them(clip, scenes, tmp_path):
     (tmp_path / "last.kpc").write_bytes(scenes[0])
     assert kpjoin.main([str(clip), str(tmp_path / "last.kpc"), "-o", str(tmp_path / "both.kpc")]) == 0
-    assert Groups(tmp_path / "both.kpc").timeline.spans[2:] == (Span(19, 11), Span(30, 11))
+    both = Groups(tmp_path / "both.kpc").timeline.spans
+    assert both[2:] == (Span(19, 11), Span(30, 11))
+    assert kpjoin.main([str(tmp_path / "both.kpc"), str(clip), "-o", str(tmp_path / "all.kpc")]) == 0
+    again = Groups(tmp_path / "all.kpc").timeline.spans
+    assert again == (*both, *(Span(41 + one.start, one.count) for one in both[:3]))
 
 
 def test_files_that_do_not_make_up_a_clip_are_refused(clip, scenes, tmp_path, capsys):
@@ -212,7 +216,7 @@ def test_files_that_do_not_make_up_a_clip_are_refused(clip, scenes, tmp_path, ca
     output = tmp_path / "out.kpc"
     for names, code, complaint in (
         (["early", "late"], 2, "leave no frame out"),
-        (["early", "early"], 2, "leave no frame out"),
+        (["late", "late"], 2, "leave no frame out"),
         (["early"], 2, "give two or more"),
         (["early", "slower"], 2, "runs at 12.5 fps"),
         (["early", "none"], 1, "No such file"),

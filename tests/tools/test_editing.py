@@ -142,13 +142,20 @@ def test_a_part_shows_what_the_clip_shows_then(variant):
 def test_the_whole_clip_stays_as_it_is_and_what_cannot_be_cut_is_refused():
     scene = quantised(time=5)
     assert common_rows(scene) == 4
-    assert trimmed(scene, 0.0, 9.0) == (scene, (0.0, 1.0))
+    for end in (1.1, 1.104, np.inf):  # with the last frame; as kpinfo shows it, rounded; not said
+        assert trimmed(scene, 0.0, end) == (scene, (0.0, 1.0))
+    assert trimmed(scene, 1.05, np.inf)[1] == (0.75, 1.0)  # within the last frame
     uneven = replace(scene, motion=quantised("displaced", time=4).motion)
     assert common_rows(uneven) == 1
     with pytest.raises(UsageError, match="no rows in common"):
         trimmed(uneven, 0.2, 0.5)
-    for start, end in ((0.5, 0.5), (1.0, 2.0), (0.6, 0.2)):
-        with pytest.raises(UsageError, match="lasts from 0 to 1 s"):
+    for start, end, message in (
+        (0.5, 0.5, "ends before it begins"),
+        (0.6, 0.2, "ends before it begins"),
+        (1.1, np.inf, "--from 1.1s: the clip lasts 1.10 s"),
+        (0.0, 2.0, "--to 2s: the clip lasts 1.10 s"),
+    ):
+        with pytest.raises(UsageError, match=message):
             trimmed(scene, start, end)
     with pytest.raises(UsageError, match="static"):
         trimmed(quantised_static(), 0.0, 0.5)
@@ -224,8 +231,8 @@ def test_groups_are_placed_retimed_and_cut(clip, capsys):
     command = ["--from", "1.2s", "--to", "2.5s", "--fps", "20", "--scale", "2", "--box", "-0.4,-0.8,-0.6,0.6,0.5,0.4"]
     assert kpedit.main([str(clip), "-o", str(out), *command]) == 0
     opened, whole = groups.Groups(out), groups.Groups(clip)
-    assert [(s.start, s.count) for s in opened.timeline.spans] == [(18, 21), (36, 21)] and opened.clip.fps == 20
-    assert f" s of the clip, {opened.clip.frame_count} frames at 20 fps\n" in capsys.readouterr().out
+    assert [(s.start, s.count) for s in opened.timeline.spans] == [(0, 21), (18, 21)] and opened.clip.fps == 20
+    assert " s of the clip (whole groups are kept), 39 frames at 20 fps, 1.95 s\n" in capsys.readouterr().out
     one = read(opened.open(0))
     assert one.aabb == pytest.approx(2 * read(whole.open(1)).aabb) and opened.metadata().view_limits.reach == 1.5
     assert "from 1.2, to 2.5, box" in opened.metadata().provenance["history"][-1]
@@ -242,6 +249,18 @@ def test_clips_of_different_rates_are_joined_when_told_to(tmp_path, capsys):
     assert [(s.start, s.count) for s in joined.timeline.spans] == [(0, 21), (21, 21)] and joined.clip.fps == 20
     for number in range(2):
         assert symbols_equal(read(joined.open(number)), quantised())
+
+
+@pytest.mark.parametrize("fps", [3.0, 24.0, 25.0, 60.0])
+def test_groups_without_shared_frames_stay_without_a_gap_at_any_rate(fps, tmp_path, capsys):
+    write(quantised(), tmp_path / "one.kpc")
+    assert kpjoin.main([str(tmp_path / "one.kpc")] * 3 + ["-o", str(tmp_path / "three.kpc")]) == 0
+    assert kpjoin.main([str(tmp_path / "three.kpc")] * 2 + ["--fps", str(fps), "-o", str(tmp_path / "six.kpc")]) == 0
+    spans = groups.Groups(tmp_path / "six.kpc").timeline.spans
+    assert [one.start for one in spans[1:]] == [one.last + 1 for one in spans[:-1]] and len(spans) == 6
+    assert abs(spans[5].last - 65 * fps / 10) <= 1.5 + fps / 10  # each half as long as before, to half a frame
+    command = [str(tmp_path / "three.kpc"), "-o", str(tmp_path / "short.kpc"), "--fps", "0.01"]
+    assert kpedit.main(command) == 2 and "--fps 0.01: at this rate" in capsys.readouterr().err
 
 
 def symbols_equal(one, other):

@@ -98,11 +98,12 @@ def test_a_saved_view_opens_the_scene(folder):
     "options, code, words",
     [
         (["--title", "\x1b[2J"], 2, "control characters"),
-        (["--date", "yesterday"], 2, "date is too long"),
+        (["--date", "yesterday"], 2, "is no date like 2026"),
+        (["--date", "2026-13"], 2, "is no date like 2026"),
         (["--up", "0,0,0"], 2, "is not a direction"),
         (["--view-limits", "azimuth=3"], 2, "is not like azimuth=-30:30"),
         (["--view-limits", "azimuth=30:-30"], 2, "least value is above the largest"),
-        (["--provenance", "broken.json"], 2, "not JSON"),
+        (["--provenance", "broken.json"], 2, 'such as {"preset": "fast"}'),
         (["--provenance", "wrong.json"], 1, "seed is no integer"),
     ],
 )

@@ -75,8 +75,8 @@ def test_films_last_as_long_as_the_clip(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--from", 2], "no frame lies"),
-        (["--to", 2], "all lasts 1.1 s"),
+        (["--from", 2], "the last frame is at 1.00 s"),
+        (["--to", "2s"], "the last frame ends at 1.10 s"),
         (["--from", 0.5, "--to", 0.4], "no frame lies"),
         (["--frames", "5-11"], "the last frame is 10"),
         (["--frames", "4-2"], "range of frames"),

@@ -54,12 +54,7 @@ def _command(argv: list[str]) -> None:
         size, kept_s = save(with_metadata(options.scene, metadata), options.output), None
     else:
         size, kept_s = edit(options.scene, options.output, edits, metadata)
-    part = ""
-    if kept_s is not None:
-        clip = Groups(options.output).clip
-        frames = f"{clip.frame_count} frames at {clip.fps:g} fps"
-        part = f", {kept_s[0]:.3f} to {kept_s[1]:.3f} s of the clip, {frames}"
-    print(f"{options.output}: {size:,} bytes{part}")
+    print(f"{options.output}: {size:,} bytes{_changed_time(options, kept_s)}")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -94,9 +89,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_edits(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--from", dest="start", type=_time_s, metavar="1.5s", help="keep the clip from then on (default: its start)"
+        "--from", dest="start", type=cli.time_s, metavar="1.5s", help="keep the clip from then on (default: its start)"
     )
-    parser.add_argument("--to", dest="end", type=_time_s, metavar="4s", help="keep the clip until then")
+    parser.add_argument("--to", dest="end", type=cli.time_s, metavar="4s", help="keep the clip until then")
     parser.add_argument(
         "--box",
         type=cli.box_corners,
@@ -118,6 +113,22 @@ def _add_edits(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fps", type=cli.frame_rate(0.001, 1000.0), metavar="F", help="frames per second, at the same length"
     )
+
+
+def _changed_time(options: argparse.Namespace, kept_s: tuple[float, float] | None) -> str:
+    """Return, in words, which part of the clip was kept, and how long the result is; nothing if its time is as before.
+
+    Args:
+        options: of the command line.
+        kept_s: from when to when the result is of the source, seconds; None for all of it.
+    """
+    if (kept_s, options.speed, options.fps) == (None, None, None):
+        return ""
+    result = Groups(options.output)
+    is_widened = not Groups(options.scene).is_single
+    part = "" if kept_s is None else f", {kept_s[0]:.3f} to {kept_s[1]:.3f} s of the clip"
+    part += " (whole groups are kept)" if kept_s is not None and is_widened else ""
+    return f"{part}, {result.clip.frame_count:,} frames at {result.clip.fps:g} fps, {result.clip.total_s:.2f} s"
 
 
 def _edits_from(options: argparse.Namespace) -> Edits:
@@ -202,9 +213,9 @@ def _json_object(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path}: not JSON; write an object such as {{'preset': 'fast'}}") from error
+        raise UsageError(f'{path}: not JSON; write an object such as {{"preset": "fast"}}') from error
     if not isinstance(document, dict):
-        raise UsageError(f"{path}: no JSON object; write one such as {{'preset': 'fast'}}")
+        raise UsageError(f'{path}: no JSON object; write one such as {{"preset": "fast"}}')
     return document
 
 
@@ -220,10 +231,6 @@ def _turn(text: str) -> tuple[str, float]:
     if axis not in ("x", "y", "z"):
         raise argparse.ArgumentTypeError(f"{text!r} is not a turn such as x:-90")
     return axis, cli.number_within(degrees, -360, 360)
-
-
-def _time_s(text: str) -> float:
-    return 0.0 if text in ("0", "0s") else cli.duration_s(text)
 
 
 def _speed(text: str) -> float:

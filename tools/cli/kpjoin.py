@@ -27,8 +27,8 @@ def main(argv: list[str] | None = None) -> int:
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(
         prog="kpjoin",
-        description="Join .kpc files into one clip. Groups of a clip are put in the order of their frames; other files "
-        "follow one another in the given order.",
+        description="Join .kpc files into one clip. Parts of one clip are put in the order of their frames; other "
+        "files follow one another in the given order.",
     )
     cli.add_version_option(parser)
     parser.add_argument("scenes", nargs="+", type=cli.input_path, metavar="SCENE", help=".kpc files")
@@ -47,11 +47,13 @@ def _command(argv: list[str]) -> None:
     if options.output.exists() and any(options.output.samefile(scene) for scene in options.scenes):
         raise UsageError(f"{options.output}: is one of the inputs; choose another output with -o")
     with tempfile.TemporaryDirectory(dir=options.output.parent) as folder:
-        scenes = options.scenes if options.fps is None else _at_rate(options.scenes, options.fps, Path(folder))
-        parts = groups.group_inputs(scenes)
+        parts = groups.group_inputs(options.scenes)
+        groups.check_parts(parts)
+        if options.fps is not None:
+            parts = groups.group_inputs(_at_rate(options.scenes, options.fps, Path(folder)))
         size = groups.write(parts, options.output)
     clip = groups.Timeline(tuple(part.span for part in parts), parts[0].fps).clip
-    duration = f"{clip.frame_count} frames at {clip.fps:g} fps, {clip.total_s:.2f} s"
+    duration = f"{clip.frame_count:,} frames at {clip.fps:g} fps, {clip.total_s:.2f} s"
     print(f"{options.output}: {size:,} bytes, {len(parts)} groups, {duration}")
 
 

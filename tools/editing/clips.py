@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from kpc.format.coding.quantise import QuantisedScene
-from kpc.format.common.errors import UsageError
+from kpc.format.common.errors import FormatError, UsageError
 from kpc.format.container import groups, rewriting
+from kpc.format.container.groups import Span
 from kpc.format.container.rewriting import with_metadata
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Clip
 from kpc.tools.editing.cropping import cropped
 from kpc.tools.editing.files import edited
 from kpc.tools.editing.placing import Placement, placed, placed_metadata
-from kpc.tools.editing.timing import at_rate, at_speed, span_at_rate, trimmed
+from kpc.tools.editing.timing import at_rate, at_speed, check_part, spans_at_rate, trimmed
 
 
 @dataclass(frozen=True)
@@ -82,25 +83,29 @@ def _edit_groups(
     """Edit a clip in groups, of which whole groups are kept."""
     numbers = list(range(len(clip)))
     kept: tuple[float, float] | None = None
-    duration_s, fps = clip.clip.duration_s, clip.clip.fps
+    duration_s, fps, spans = clip.clip.duration_s, clip.clip.fps, clip.timeline.spans
     if edits.part_s is not None:
         start_s, end_s = edits.part_s
+        check_part(clip.clip, start_s, end_s)
         shown = [[time * duration_s for time in clip.timeline.display_span(number)] for number in numbers]
+        shown[-1][1] = clip.clip.total_s  # its last frame is shown as long as the others
         numbers = [number for number in numbers if shown[number][0] < end_s and start_s < shown[number][1]]
-        if not numbers or start_s >= end_s:
-            raise UsageError(f"--from {start_s:g}s --to {end_s:g}s: the clip lasts from 0 to {duration_s:g} s")
-        first, last = (clip.timeline.spans[number] for number in (numbers[0], numbers[-1]))
-        origin = clip.timeline.spans[0].start
-        kept = (first.start - origin) / fps, (last.last - origin) / fps
+        first, last = spans[numbers[0]], spans[numbers[-1]]
+        kept = (first.start - spans[0].start) / fps, (last.last - spans[0].start) / fps
+        spans = tuple(Span(span.start - first.start, span.count) for span in spans)
         metadata = _in_part(metadata, kept, clip.clip)
     fps *= edits.speed or 1.0
+    spans = spans[numbers[0] : numbers[-1] + 1]
+    if edits.fps is not None:
+        spans = spans_at_rate(spans, fps, edits.fps)
+        try:
+            groups.check_spans(spans, clip.name)
+        except FormatError as error:
+            raise UsageError(f"--fps {edits.fps:g}: at this rate the groups have too few or too many frames") from error
     parts = []
-    for number in numbers:
-        span = clip.timeline.spans[number]
-        if edits.fps is not None:
-            span = span_at_rate(span, fps, edits.fps)
+    for number, span in zip(numbers, spans, strict=True):
 
-        def change(scene: QuantisedScene, span: groups.Span = span) -> QuantisedScene:
+        def change(scene: QuantisedScene, span: Span = span) -> QuantisedScene:
             return replace(_changed(scene, edits), clip=Clip(span.count, edits.fps or fps))
 
         parts.append(groups.GroupInput.of(edited(clip.open(number), change), span.start))

@@ -5,12 +5,14 @@ of their rows: it begins and ends with a row of all planes, at which the picture
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 
 import numpy as np
 
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.common.cli import TIME_SLACK_S
 from kpc.format.common.errors import UsageError
 from kpc.format.container.groups import Span
 from kpc.format.container.scene_layout import AXIS_LIMIT
@@ -29,10 +31,28 @@ def at_rate(scene: QuantisedScene, fps: float) -> QuantisedScene:
     return replace(scene, clip=Clip(1 + round(scene.clip.duration_s * fps), fps))
 
 
-def span_at_rate(span: Span, before: float, after: float) -> Span:
-    """Return the frames of a group of a clip whose frame rate changes."""
-    start, last = (round(frame * after / before) for frame in (span.start, span.last))
-    return Span(start, last - start + 1)
+def spans_at_rate(spans: Sequence[Span], before: float, after: float) -> tuple[Span, ...]:
+    """Return the frames of the groups of a clip whose frame rate changes.
+
+    A group that ended right before the next one still does.
+    """
+    found = []
+    for span, following in zip_longest(spans, spans[1:]):
+        start, last = (round(frame * after / before) for frame in (span.start, span.last))
+        if following is not None and following.start == span.last + 1:
+            last = round(following.start * after / before) - 1
+        found.append(Span(start, last - start + 1))
+    return tuple(found)
+
+
+def check_part(clip: Clip, start_s: float, end_s: float) -> None:
+    """Raise a UsageError if a clip does not have a part from one time to another, seconds; it may end at infinity."""
+    if start_s >= clip.total_s:
+        raise UsageError(f"--from {start_s:g}s: the clip lasts {clip.total_s:.2f} s")
+    if clip.total_s + TIME_SLACK_S < end_s < math.inf:
+        raise UsageError(f"--to {end_s:g}s: the clip lasts {clip.total_s:.2f} s")
+    if start_s >= end_s:
+        raise UsageError(f"--from {start_s:g}s --to {end_s:g}s: the part ends before it begins; swap or widen them")
 
 
 def common_rows(scene: QuantisedScene) -> int:
@@ -61,9 +81,8 @@ def trimmed(scene: QuantisedScene, start_s: float, end_s: float) -> tuple[Quanti
     parts, duration_s = common_rows(scene), scene.clip.duration_s
     if parts < 1 or duration_s <= 0:
         raise UsageError("--from, --to: the scene is static; there is nothing to cut")
-    if not 0 <= start_s < min(end_s, duration_s):
-        raise UsageError(f"--from {start_s:g}s --to {end_s:g}s: the clip lasts from 0 to {duration_s:g} s")
-    first = math.floor(start_s / duration_s * parts + 1e-9)
+    check_part(scene.clip, start_s, end_s)
+    first = min(parts - 1, math.floor(start_s / duration_s * parts + 1e-9))
     last = min(parts, math.ceil(min(end_s, duration_s) / duration_s * parts - 1e-9))
     if (first, last) == (0, parts):
         if parts == 1 and (start_s > 0 or end_s < duration_s):

@@ -18,8 +18,6 @@ from kpc.tools.rendering.shots import MAX_FPS, MAX_PICTURES, MIN_FPS, SHUTTER_IN
 MAX_SIDE = 16384
 # The most samples along a side of a pixel.
 MAX_SAMPLES = 16
-# Seconds that --from and --to may name.
-MAX_SECONDS = 1e6
 
 
 def parser() -> argparse.ArgumentParser:
@@ -111,9 +109,8 @@ def add_times(group: argparse._ArgumentGroup) -> None:
         metavar="F",
         help="frames per second; the clip and the path keep their durations (default: the clip's rate)",
     )
-    seconds = functools.partial(cli.number_within, low=0.0, high=MAX_SECONDS, name="a number of seconds")
-    group.add_argument("--from", dest="start_s", type=seconds, metavar="S", help="begin at this second")
-    group.add_argument("--to", dest="end_s", type=seconds, metavar="S", help="end before this second")
+    group.add_argument("--from", dest="start_s", type=cli.time_s, metavar="1.5s", help="begin at this time")
+    group.add_argument("--to", dest="end_s", type=cli.time_s, metavar="4s", help="end before this time")
     group.add_argument(
         "--frames", type=_range, metavar="A-B", help="render the frames A to B only, counted from 0 at --fps"
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.scene.cameras import Camera, View, load_views
 from kpc.format.scene.rig import Rig
@@ -102,14 +103,14 @@ def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: boo
             raise UsageError(f"--frames {first}-{last}: the last frame is {timeline.count - 1}")
     if options.start_s is not None or options.end_s is not None:
         start_s, end_s = options.start_s or 0.0, options.end_s
-        if end_s is not None and end_s * fps > timeline.count + SLACK:
-            raise UsageError(f"--to {end_s:g}: all lasts {timeline.count / fps:g} s")
+        if end_s is not None and end_s > timeline.count / fps + cli.TIME_SLACK_S:
+            raise UsageError(f"--to {end_s:g}s: the last frame ends at {timeline.count / fps:.2f} s")
         first = math.ceil(start_s * fps - SLACK)
-        last = last if end_s is None else math.ceil(end_s * fps - SLACK) - 1
-        if not first <= last < timeline.count:
-            raise UsageError(
-                f"no frame lies from --from {start_s:g} up to --to {(last + 1) / fps:g} s; swap or widen them"
-            )
+        if first > last:
+            raise UsageError(f"--from {start_s:g}s: the last frame is at {last / fps:.2f} s")
+        last = last if end_s is None else min(last, math.ceil(end_s * fps - SLACK) - 1)
+        if first > last:
+            raise UsageError(f"--from {start_s:g}s --to {end_s:g}s: no frame lies between them; swap or widen them")
     return Shots(timeline, range(first, last + 1, options.step), fps / options.step, options.shutter)
 
 
