@@ -12,6 +12,7 @@ from kpc.encoder.datasets.video import read_video
 from kpc.format.common.errors import DisplayError
 from kpc.format.container.sources import open_source
 from kpc.format.scene.metadata import ViewLimits
+from kpc.player.app import imgui_renderer
 from kpc.player.app import player as player_module
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.desktop import glfw, imgui
@@ -289,10 +290,12 @@ def every_pixel_is_used(player: Player) -> None:
     """Also where a screen unit has two pixels, and where the system asks for larger text instead."""
     window, io = player.window, player.imgui.io
     text_heights: list[float] = []
+    paddings: list[float] = []
     build = player.panels.build
 
     def measuring(asks: bool) -> None:
         text_heights.append(imgui.get_font_size() * io.display_framebuffer_scale[0])
+        paddings.append(imgui.get_style().window_padding[0] * io.display_framebuffer_scale[0])
         build(asks)
 
     for units, pixels, scale in (
@@ -301,7 +304,7 @@ def every_pixel_is_used(player: Player) -> None:
         ((320, 240), (320, 240), 2.0),
     ):
         with replaced(Window, size=units, pixels=pixels, text_scale=scale):
-            with replaced(player.panels, build=measuring):
+            with replaced(player.panels, build=measuring), replaced(imgui_renderer, ROOM_EM=(1.0, 1.0)):
                 player.frame()
             assert player.snapshot().canvas == pixels
             shown = (
@@ -323,6 +326,10 @@ def every_pixel_is_used(player: Player) -> None:
             assert turned == approx(0.1 * np.pi, rel=1e-3)  # a tenth of the window's height, whatever its units
             assert window.unscaled_size == (units if pixels != units else tuple(n / scale for n in units))
     assert text_heights[1:] == approx([2 * text_heights[0]] * 2, rel=0.05)  # sizes of text are integers
+    assert paddings == approx([paddings[0], 2 * paddings[0], 2 * paddings[0]])
+    with replaced(player.state, text_size=3.0), replaced(player.panels, build=measuring):
+        player.frame()
+    assert text_heights[-1] * imgui_renderer.ROOM_EM[0] == approx(player.window.size[0], rel=0.05)  # room for it
     player.frame()
 
 

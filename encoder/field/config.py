@@ -175,8 +175,9 @@ class TrainConfig:
     # Steps of fine-tuning after each group of planes is quantised (`kpc.encoder.rdo.sequential_finetune`); 0 for none.
     # Room: with 100, files are 2 % smaller at equal error.
     tune_steps: int = 60
-    # Steps of training from which on coding takes its full effort (`coding_effort`); 0 for full effort always.
-    thorough_from: int = 0
+    # Steps of training from which on coding takes its full effort (`coding_effort`); 0 for full effort always. A run of
+    # fewer steps than this is a trial, which would otherwise be coded for longer than it is trained.
+    thorough_from: int = 1000
 
     def __post_init__(self) -> None:
         positive = (
@@ -230,10 +231,7 @@ class TrainConfig:
         return Variation(self.robust_space_variation, self.transient_variation, self.robust_tv_scale**-2)
 
     def coding_effort(self, steps: float) -> float:
-        """Return the share of the usual effort that coding takes after so many steps of training, in [1 / 16, 1].
-
-        Otherwise a draft would be coded for longer than it was trained.
-        """
+        """Return the share of the usual effort that coding takes after so many steps of training, in [1 / 16, 1]."""
         return 1.0 if steps >= self.thorough_from else max(steps / self.thorough_from, 1 / 16)
 
     @property

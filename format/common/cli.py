@@ -37,7 +37,7 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
 
     Returns:
         0 for success; 1 for a KpcError, or an error of the operating system that names a file or a full disk; 2 for a
-        usage error; 130 after Ctrl-C. Any other exception is a bug and is raised with its traceback.
+        usage error; 130 after Ctrl-C or SIGTERM. Any other exception is a bug and is raised with its traceback.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -125,6 +125,17 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder, and those above it, unless it is there.
+
+    Raises:
+        UsageError: a file has that name.
+    """
+    if path.exists() and not path.is_dir():
+        raise UsageError(f"{path}: is a file, not a folder; give another name")
+    path.mkdir(parents=True, exist_ok=True)
 
 
 def input_path(text: str) -> Path:

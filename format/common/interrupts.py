@@ -1,4 +1,4 @@
-"""Ctrl-C: the first ends a command in an orderly way, the second at once.
+"""Ctrl-C, and SIGTERM alike: the first ends a command in an orderly way, the second at once.
 
 Python handles a signal between two bytecodes of the main thread, which may be long within compiled code, and what is
 raised there is lost if it happens in a destructor or a callback of C. So a thread, which the C runtime wakes, ends the
@@ -17,6 +17,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
+
+SIGNALS = signal.SIGINT, signal.SIGTERM
 
 # Seconds that the second Ctrl-C leaves to the exception of the first, to remove temporary files.
 GRACE_S = 0.3
@@ -81,27 +83,32 @@ def ending_at_once(name: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def heeded(name: str) -> Iterator[None]:
-    """Handle Ctrl-C as described above while the command `name` runs; in other threads than the main one do nothing.
+    """Handle Ctrl-C and SIGTERM as described above while the command `name` runs; in other threads than the main one do
+    nothing.
 
-    A process for which Ctrl-C is ignored, such as one in the background of a shell without job control, goes on
+    A process for which one of them is ignored, as Ctrl-C is in the background of a shell without job control, goes on
     ignoring it, and a handler of the caller's own stays.
     """
     global _asked, _is_pending, _is_heard
     is_main = threading.current_thread() is threading.main_thread()
-    own = signal.getsignal(signal.SIGINT)
-    if not is_main or own not in (signal.default_int_handler, handle, _loading):
+    own = {number: signal.getsignal(number) for number in SIGNALS}
+    plain = (signal.default_int_handler, signal.SIG_DFL, handle, _loading)
+    own = {number: handler for number, handler in own.items() if is_main and handler is not None and handler in plain}
+    if not own:
         yield
         return
     reader, writer = socket.socketpair()  # sockets, since Windows takes no other
     writer.setblocking(False)
     before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-    signal.signal(signal.SIGINT, handle)
+    for number in own:
+        signal.signal(number, handle)
     watcher = threading.Thread(target=_end_in_time, args=(reader, name), name="Ctrl-C", daemon=True)
     watcher.start()
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, own)
+        for number, handler in own.items():
+            signal.signal(number, handler)
         signal.set_wakeup_fd(before)
         _asked = _is_pending = _is_heard = False
         writer.close()
@@ -121,8 +128,10 @@ def _end_in_time(reader: socket.socket, name: str) -> None:
                 numbers = reader.recv(64)
                 if not numbers:
                     return
-                count += sum(numbers.count(number) for number in (signal.SIGINT, signal.SIGTERM))
-                is_asked |= signal.getsignal(signal.SIGINT) is handle  # which may have to wait for compiled code
+                count += sum(numbers.count(number) for number in SIGNALS)
+                is_asked |= any(
+                    signal.getsignal(number) is handle for number in SIGNALS
+                )  # which may have to wait for compiled code
                 if count > 1:
                     overdue_at = min(overdue_at, time.monotonic() + GRACE_S)
             if count == 1 and _is_heard:

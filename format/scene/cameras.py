@@ -122,7 +122,8 @@ def load_views(path: str | os.PathLike[str]) -> list[View]:
     try:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{path}: not JSON ({error}); write it anew") from error
+        reason = "it is no text" if isinstance(error, UnicodeDecodeError) else error
+        raise DatasetError(f"{path}: not JSON ({reason}); write it anew") from error
     document = rewritten(str(path), document)
     views = [_parse_view(f"{path} frame {n}", {**document, **frame}, n) for n, frame in enumerate(document["frames"])]
     if not views:

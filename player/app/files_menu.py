@@ -6,6 +6,7 @@ from kpc.format.common.text import valid_unicode
 from kpc.format.container.http_address import is_url
 from kpc.player.app.actions import Actions
 from kpc.player.app.desktop import imgui
+from kpc.player.app.widgets import tip
 
 # Files of the playlist around the present one that the menu shows.
 SHOWN_FILES = 12
@@ -16,7 +17,7 @@ def files_button(actions: Actions) -> None:
     playlist = actions.playlist
     if imgui.button("open"):
         imgui.open_popup("files")
-    imgui.set_item_tooltip("Open another file (Ctrl+O, Page Up, Page Down)")
+    tip("Open another file (Ctrl+O, Page Up, Page Down)")
     if not imgui.begin_popup("files"):
         return
     if imgui.menu_item("choose a file...", "Ctrl+O", False)[0]:

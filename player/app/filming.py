@@ -2,6 +2,7 @@
 
 import time as clock
 
+from kpc.format.common import interrupts
 from kpc.player.app.controls import OrbitView
 from kpc.player.app.output_files import OutputFiles
 from kpc.player.app.recording import FILM_FPS, Recording, frames_due
@@ -110,6 +111,7 @@ class Filming:
         """Finish the video that is being written; return what to report of it, None if there is none."""
         if self.recording is None:
             return None
+        interrupts.heard()  # after Ctrl-C, too, the file takes the time that it needs
         self.recording.close(FINISH_TIMEOUT_S)
         return self.recording.failure or _saved(self.recording)
 

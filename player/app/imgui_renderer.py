@@ -5,7 +5,7 @@ import ctypes
 import moderngl
 
 from kpc.player.app.desktop import imgui
-from kpc.player.app.widgets import ACCENT
+from kpc.player.app.widgets import ACCENT, ROOM_EM
 from kpc.player.gl import shader
 
 # Height of the text, and a scale at which ImGui's default font is its vector font instead of the bitmap font.
@@ -53,9 +53,11 @@ class ImGuiRenderer:
         max_side = ctx.info["GL_MAX_TEXTURE_SIZE"]
         imgui.get_platform_io().renderer_texture_max_width = max_side
         imgui.get_platform_io().renderer_texture_max_height = max_side
-        _style()
         imgui.get_style().font_scale_main = VECTOR_FONT_SCALE  # which default font is added depends on it
         self._font = self.io.fonts.add_font_default()
+        self._scale = 1.0
+        _set_colours()
+        _set_sizes(self._scale)
         self._program = ctx.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
         self._vertices = ctx.buffer(reserve=1 << 16, dynamic=True)
         self._indices = ctx.buffer(reserve=1 << 16, dynamic=True)
@@ -71,7 +73,8 @@ class ImGuiRenderer:
         Args:
             window: (width, height) of the window, screen units.
             framebuffer: (width, height) of the window, pixels.
-            content_scale: size of the text, pixels per pixel of a screen of ordinary density.
+            content_scale: size of the text, pixels per pixel of a screen of ordinary density; less is used where the
+                window lacks the room.
             seconds: since the last frame.
         """
         self._pixels = framebuffer
@@ -79,7 +82,11 @@ class ImGuiRenderer:
         self.io.display_size = window
         self.io.display_framebuffer_scale = ratio
         self.io.delta_time = max(seconds, 1e-4)
-        imgui.get_style().font_scale_main = max(content_scale / max(ratio[0], 1e-6), 0.5)
+        room = min(side / (count * FONT_SIZE) for side, count in zip(window, ROOM_EM, strict=True))
+        scale = max(min(content_scale / max(ratio[0], 1e-6), room), 0.5)
+        if scale != self._scale:
+            self._scale = scale
+            _set_sizes(scale)
         imgui.new_frame()
         imgui.push_font(self._font, FONT_SIZE)
 
@@ -171,17 +178,31 @@ class ImGuiRenderer:
                 wanted.set_status(status.DESTROYED)
 
 
-def _style() -> None:
-    """Set colours and sizes of all widgets."""
+def _set_sizes(scale: float) -> None:
+    """Set the sizes of all widgets.
+
+    Args:
+        scale: of the text and of all around it, 1 for a screen of ordinary density.
+    """
+    style = imgui.get_style()
+    style.font_scale_main = scale
+    style.window_rounding = style.frame_rounding = style.grab_rounding = 5.0 * scale
+    style.scrollbar_rounding = style.popup_rounding = 5.0 * scale
+    style.window_border_size = 0.0
+    style.grab_min_size, style.scrollbar_size = 12.0 * scale, 14.0 * scale
+    style.window_padding = (10 * scale, 8 * scale)
+    style.frame_padding = (4 * scale, 3 * scale)
+    style.item_spacing = (8 * scale, 5 * scale)
+    style.item_inner_spacing = (4 * scale, 4 * scale)
+    style.cell_padding = (8 * scale, 2 * scale)
+
+
+def _set_colours() -> None:
+    """Set the colours of all widgets."""
     imgui.style_colors_dark()
     style = imgui.get_style()
-    style.window_rounding = style.frame_rounding = style.grab_rounding = 5.0
-    style.window_border_size = 0.0
-    style.window_padding = (10, 8)
-    style.item_spacing = (8, 5)
     style.colors[imgui.Col.WINDOW_BG] = (0.06, 0.07, 0.09, 0.72)
     style.colors[imgui.Col.TEXT_DISABLED] = (0.74, 0.76, 0.80, 1.0)
-    style.cell_padding = (8, 2)
     style.colors[imgui.Col.FRAME_BG] = (1.0, 1.0, 1.0, 0.10)
     style.colors[imgui.Col.FRAME_BG_HOVERED] = (1.0, 1.0, 1.0, 0.16)
     style.colors[imgui.Col.FRAME_BG_ACTIVE] = (1.0, 1.0, 1.0, 0.20)

@@ -55,7 +55,7 @@ def _command(argv: list[str]) -> None:
         return
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames} is not positive")
-    Path(options.folder).mkdir(parents=True, exist_ok=True)
+    cli.make_folder(Path(options.folder))
     path = None if options.path is None else CameraPath.load(options.path)
 
     # Imported here so that errors in the options are reported without OpenGL's libraries.

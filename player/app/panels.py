@@ -32,6 +32,7 @@ from kpc.player.app.widgets import (
     panel,
     place_bar,
     place_next,
+    tip,
     toggle,
     window_size,
 )
@@ -43,6 +44,8 @@ MIN_MESSAGE_EM = 12.0
 SLIDER_FPS = (5.0, 120.0)
 # Characters of the device's name that are shown.
 DEVICE_CHARACTERS = 32
+# Characters of the name of the film that is written.
+NAME_CHARACTERS = 20
 
 
 class Panels:
@@ -125,7 +128,7 @@ class Panels:
             imgui.text(f"{rate:.{1 if rate < 10 else 0}f} frames/s, each {1e3 * statistics.draw_s:.0f} ms")
         else:
             imgui.text("still picture" if self.scene_view.is_sharp else "refining the picture")
-        imgui.set_item_tooltip("Frames that come each second, and the time that drawing one takes")
+        tip("Frames that come each second, and the time that drawing one takes")
         imgui.text_disabled("{}x{} of {}x{} pixels".format(*view.raster, *view.canvas.size))
         imgui.text_disabled(f"{statistics.samples:.1f} samples per ray, {view.renderer.memory_bytes / 1e6:.0f} MB")
         imgui.text_disabled(view.device.split("(")[0].strip()[:DEVICE_CHARACTERS])
@@ -145,11 +148,11 @@ class Panels:
         )
         if changed and wanted != number:
             quality.choose(LEVEL_NAMES[wanted])
-        imgui.set_item_tooltip("From fastest to exact (key - and = or +)")
+        tip("From fastest to exact (key - and = or +)")
         label("adapt to")
         holds = quality.target_s is not None
         changed, holds = imgui.checkbox("##adapt", holds)
-        imgui.set_item_tooltip("Lower and raise the quality so that so many frames come each second (U)")
+        tip("Lower and raise the quality so that so many frames come each second (U)")
         imgui.same_line()
         imgui.set_next_item_width((CONTROL_EM - 2) * imgui.get_font_size())
         flags = imgui.SliderFlags.NO_INPUT | imgui.SliderFlags.LOGARITHMIC
@@ -161,7 +164,7 @@ class Panels:
         if state.scene.is_dynamic and LEVELS[quality.level].folded:
             label("motion")
             _, state.exact = imgui.checkbox("exact", state.exact)
-            imgui.set_item_tooltip("Draw what moves as exactly as what does not, which takes longer (F)")
+            tip("Draw what moves as exactly as what does not, which takes longer (F)")
 
     def _viewpoints(self) -> None:
         """The cameras of the scene, and the named viewpoints."""
@@ -178,8 +181,8 @@ class Panels:
 
     def _transport(self, bottom: float) -> float:
         """Play, position, speed and loop along the lower edge, above `bottom`; return the upper edge."""
-        playback, duration_s = self.state.playback, self.state.stream.clip.duration_s
-        if duration_s == 0:
+        playback, clip = self.state.playback, self.state.stream.clip
+        if clip.duration_s == 0:
             return bottom
         place_bar(bottom)
         with panel("transport", fits_content=False):
@@ -188,7 +191,7 @@ class Panels:
                 playback.toggle()
             imgui.same_line()
             imgui.set_next_item_width(max(imgui.get_content_region_avail()[0] - em(13.5), em(4)))
-            text = f"{playback.time * duration_s:.2f} / {duration_s:.2f} s"
+            text = f"{playback.time * clip.duration_s:.2f} / {clip.total_s:.2f} s"
             changed, time = imgui.slider_float("##time", playback.time, 0.0, 1.0, text, imgui.SliderFlags.NO_INPUT)
             if changed:
                 self.state.scrub(time)
@@ -233,7 +236,7 @@ class Panels:
         recording = filming.recording
         if recording is None:
             return bottom
-        name = recording.path.name
+        name = shortened(recording.path.name)
         place_next(window_size()[0] / 2, bottom - em(SPACING_EM), 0.5, 1.0)
         with panel("film"):
             top = bottom - em(SPACING_EM) - imgui.get_window_height()
@@ -250,7 +253,7 @@ class Panels:
             imgui.same_line()
             if imgui.button("stop"):
                 filming.stop()
-            imgui.set_item_tooltip("End the video here; what was recorded is kept (O)")
+            tip("End the video here; what was recorded is kept (O)")
             if filming.is_along_path:
                 imgui.progress_bar(recording.taken / filming.path_frames, (-1, em(0.4)), "")
             return top
@@ -267,8 +270,16 @@ class Panels:
                     imgui.table_next_column()
                     imgui.text(binding.keys_here())
                     imgui.table_next_column()
+                    imgui.push_text_wrap_pos(0.94 * width - em(2))
                     imgui.text_disabled(binding.help)
+                    imgui.pop_text_wrap_pos()
                 imgui.end_table()
+
+
+def shortened(name: str) -> str:
+    """Return the name of a file with at most NAME_CHARACTERS, and its end, which tells takes apart."""
+    half = (NAME_CHARACTERS - 2) // 2
+    return name if len(name) <= NAME_CHARACTERS else f"{name[:half]}..{name[-half:]}"
 
 
 def _time_left(seconds: float | None) -> str:

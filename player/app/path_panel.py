@@ -7,7 +7,7 @@ from kpc.player.app.actions import Actions
 from kpc.player.app.desktop import imgui
 from kpc.player.app.path_follower import MAX_GAP_S, MIN_GAP_S
 from kpc.player.app.state import PlayerState
-from kpc.player.app.widgets import MARGIN_EM, PANEL_EM, em, panel, place_next, window_size
+from kpc.player.app.widgets import MARGIN_EM, PANEL_EM, em, panel, place_next, tip, window_size
 
 # What the panel says before there are keyframes.
 NO_KEYFRAMES = "No keyframes yet. Move the camera and\npress K, at least twice, or drop a\nsaved path on the window."
@@ -30,7 +30,7 @@ class PathPanel:
         with panel("path", scrolls=True):
             if imgui.button("add"):
                 actions.add_keyframe()
-            imgui.set_item_tooltip("Add a keyframe: the present camera and time (K)")
+            tip("Add a keyframe: the present camera and time (K)")
             imgui.same_line()
             imgui.begin_disabled(follower.is_empty)
             if imgui.button("stop" if follower.is_active and not actions.filming.is_along_path else "follow"):
@@ -79,7 +79,7 @@ class PathPanel:
         keyframe = follower.path.keyframes[number]
         if imgui.button(f"{number + 1}", (em(2), 0)):
             self.actions.to_path_position(float(keyframe.at_s or 0.0))
-        imgui.set_item_tooltip("Go to this keyframe")
+        tip("Go to this keyframe")
         imgui.same_line()
         imgui.set_next_item_width(em(5))
         if number:
@@ -90,7 +90,7 @@ class PathPanel:
             if changed:
                 with contextlib.suppress(DatasetError):  # the path would be too long
                     follower.path = follower.path.spaced(number, max(gap_s, MIN_GAP_S))
-            imgui.set_item_tooltip("Seconds since the keyframe before; drag to change")
+            tip("Seconds since the keyframe before; drag to change")
         else:
             imgui.dummy((em(5), 0))
         imgui.same_line()
@@ -98,4 +98,4 @@ class PathPanel:
         imgui.same_line()
         if imgui.button("x", (em(1.8), 0)):
             follower.remove(number)
-        imgui.set_item_tooltip("Remove this keyframe")
+        tip("Remove this keyframe")

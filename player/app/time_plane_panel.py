@@ -8,7 +8,7 @@ from kpc.player.app.desktop import imgui
 from kpc.player.app.imgui_renderer import ImGuiRenderer
 from kpc.player.app.state import PlayerState
 from kpc.player.app.time_plane_pictures import moving_part, time_plane_picture, time_planes
-from kpc.player.app.widgets import ACCENT, em, panel, place_bar, window_size
+from kpc.player.app.widgets import ACCENT, em, panel, place_bar, tip, window_size
 
 # Seconds between two updates of the picture while the scene arrives.
 REFRESH_S = 0.5
@@ -48,7 +48,7 @@ class TimePlanePanel:
             texture, axis = self._update(planes), planes[self.number][0][0]
             extent = f"{1 - self._high:.0%} to {1 - self._low:.0%} of {axis}"
             imgui.text_disabled(f"time to the right, {extent} upwards")
-            imgui.set_item_tooltip("What moves is a wave; what is static is grey")
+            tip("What moves is a wave; what is static is grey")
             size = (imgui.get_content_region_avail()[0], min(em(7), 0.25 * window_size()[1]))
             corner = imgui.get_cursor_screen_pos()
             lower, upper = (0.0, self._low), (1.0, self._high)

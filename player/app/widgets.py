@@ -17,6 +17,10 @@ LABEL_EM, CONTROL_EM, PANEL_EM = 6.5, 11.1, 19.0
 MARGIN_EM, SPACING_EM = 0.8, 0.4
 # Width of the panels along the lower edge, at most, em.
 MAX_BAR_EM = 60.0
+# Room that the panels need: the text grows no further than a window has it, em.
+ROOM_EM = 40.0, 24.0
+# Width of a text about a widget, at most, em.
+TIP_EM = 24.0
 # Width of a message over the room it has.
 MESSAGE_SHARE = 0.88
 
@@ -132,6 +136,15 @@ def choice(name: str, present: Value, names: dict[Value, str]) -> Value:
     values: Sequence[Value] = list(names)
     changed, chosen = imgui.combo(f"##{name}", values.index(present), list(names.values()))
     return values[chosen] if changed else present
+
+
+def tip(text: str) -> None:
+    """Show a text while the pointer rests on the widget before."""
+    if imgui.begin_item_tooltip():
+        imgui.push_text_wrap_pos(em(TIP_EM))
+        imgui.text(text)
+        imgui.pop_text_wrap_pos()
+        imgui.end_tooltip()
 
 
 def close_lists() -> bool:

@@ -151,7 +151,7 @@ def test_rays_through_empty_space_do_not_count() -> None:
 
 
 def test_less_effort_takes_fewer_rays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drafts are coded with a share of the rays, other presets with all."""
+    """Drafts and short runs are coded with a share of the rays."""
     monkeypatch.setattr(module, "RAYS", 800)
     scene = tiny_scene()
     validation = ValidationRays.from_cameras(scene, 300)
@@ -160,4 +160,4 @@ def test_less_effort_takes_fewer_rays(monkeypatch: pytest.MonkeyPatch) -> None:
         assert all(np.array_equal(scale[name], other[name]) for name in scale)
     draft, fast = PRESETS["draft"], PRESETS["fast"]
     assert [draft.coding_effort(steps) for steps in (1, 1500, 6000, 9000)] == [1 / 16, 1 / 4, 1, 1]
-    assert fast.coding_effort(1) == 1
+    assert [fast.coding_effort(steps) for steps in (1, 250, 1000, 3000)] == [1 / 16, 1 / 4, 1, 1]

@@ -16,6 +16,7 @@ from kpc.format.common.images import read_image
 from kpc.format.container import groups, scene_io
 from kpc.format.container.container import Reader
 from kpc.format.container.groups import GroupedScene, GroupInput, Groups, Span, Timeline
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.cpu import reference
 from kpc.player.sharing.file_server import Handler, serving
@@ -233,6 +234,9 @@ def test_kpinfo_lists_the_groups(clip, capsys):
     assert kpinfo.main([str(clip), "--verify"]) == 0
     page = capsys.readouterr().out
     assert "30 frames at 10 fps, 3.00 s, in 3 groups" in page and "verified" in page
+    named = clip.with_name("named.kpc")
+    groups.write(groups.group_inputs([clip]), named, Metadata({"camera_names": ["left", "right"]}))
+    assert kpinfo.main([str(named)]) == 0 and "names       left, right\n" in capsys.readouterr().out
     assert kpinfo.main([str(clip), "--json"]) == 0
     (info,) = json.loads(capsys.readouterr().out)["files"]
     assert [group["frames"] for group in info["groups"]] == [[0, 10], [8, 18], [19, 29]]

@@ -96,6 +96,24 @@ def test_a_handler_of_the_command_takes_as_long_as_it_needs(tmp_path: Path) -> N
     assert (done.returncode, done.stdout, done.stderr) == (0, "went on\n", "")
 
 
+def test_sigterm_ends_as_ctrl_c_does_even_where_that_is_ignored(tmp_path: Path) -> None:
+    command = """
+    import os, signal
+    from kpc.format.common import cli
+    def write(_):
+        with cli.atomic_write("film.mp4"):
+            os.kill(os.getpid(), signal.SIGTERM)
+            signal.pause()
+    def main(argv):
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        os.chdir(os.path.dirname(__file__))
+        return cli.run(write, "kpx")
+    """
+    done = interrupted(tmp_path, command)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "kpx: interrupted\n")
+    assert not [path for path in tmp_path.iterdir() if path.suffix == ".mp4"]
+
+
 def test_what_is_lost_ends_in_time(tmp_path: Path) -> None:
     command = """
     import time

@@ -11,6 +11,7 @@ import kpc
 from kpc.format.common.images import read_image
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
+from kpc.tools.cli import kprender
 from kpc.tools.rendering import content
 from kpc.tools.rendering.options import parser
 from kpc.tools.rendering.shots import shots_of
@@ -188,6 +189,19 @@ def test_resuming_skips_whole_pictures_of_this_size(
     assert times == pytest.approx([0.1, 0.2, 0.3, 0.4]) and (out / "0001.png").read_bytes() == whole
     times.clear()
     assert run(*words[:-1], out, "--size", "12x9")[0] == 0 and len(times) == 6  # another size
+
+
+def test_a_damaged_exr_is_rendered_anew_without_a_word_of_its_reader(
+    scene_file: Path, tmp_path: Path, times: list[float], capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(word) for word in (scene_file, "--frames", "0-0", *SIZE, "--resume", "--format", "exr", "-o")]
+    assert kprender.main([*words, str(tmp_path)]) == 0
+    picture = tmp_path / "0000.exr"
+    picture.write_bytes(picture.read_bytes()[:700])  # within its pixels
+    capfd.readouterr()
+    assert kprender.main([*words, str(tmp_path)]) == 0 and len(times) == 2
+    assert capfd.readouterr().err == "kprender: reference renderer (numpy)\n"
+    assert kprender.main([*words, f"{picture}/"]) == 2 and "is a file, not a folder" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["out", "x.mkv", "x.webm"])

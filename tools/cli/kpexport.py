@@ -78,7 +78,7 @@ def _export_geometry(task: Task, options: argparse.Namespace) -> None:
     render = None if options.mesh else _renderer(loaded, options)
     output = Path(options.output)
     if task.is_folder:
-        output.mkdir(parents=True, exist_ok=True)
+        cli.make_folder(output)
     started, count = clock.monotonic(), 0
     for number in progress(shots.numbers, "export", unit="files"):
         time = shots.time(number)

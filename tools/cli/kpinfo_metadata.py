@@ -14,7 +14,7 @@ def metadata_rows(metadata: Metadata, sizes: Sequence[Sequence[int]]) -> list[tu
 
     Args:
         metadata: of the file.
-        sizes: (width, height) of the pictures of the scene's cameras, which the metadata name.
+        sizes: (width, height) of the pictures of the scene's cameras, which the metadata name; empty if not known.
     """
     document = metadata.document
     rows: list[tuple[str, str]] = []
@@ -23,6 +23,7 @@ def metadata_rows(metadata: Metadata, sizes: Sequence[Sequence[int]]) -> list[tu
         rows += [(name if not k else "", line) for k, line in enumerate(lines) if line or k]
     rows += _view_rows(metadata)
     names = [f"{name} {w}x{h}" for name, (w, h) in zip(metadata.camera_names, sizes, strict=False)]
+    names = names or list(metadata.camera_names)
     if names:
         rows.append(("names", ", ".join(names[:CAMERAS_SHOWN]) + ", ..." * (len(names) > CAMERAS_SHOWN)))
     rows += _provenance_rows(metadata.provenance)

@@ -148,7 +148,7 @@ def _write_film(
     frames = (pixels(picture(number)) for number in progress(shots.numbers, output.path.name, unit="frames"))
     write_film(output.path, frames, shots.fps, film)
     size = "" if padded == (camera.width, camera.height) else f" (padded to {padded[0]}x{padded[1]})"
-    return f"{output.path}: {len(shots)} frames at {shots.fps:g} fps{size}"
+    return f"{output.path}: {len(shots)} frame{'s' * (len(shots) != 1)} at {shots.fps:g} fps{size}"
 
 
 def _write_pictures(
@@ -167,7 +167,7 @@ def _write_pictures(
     if renamed:
         _say(f"{options.cameras}: {renamed} pictures get other names, for theirs are taken or no plain file names")
     if output.is_folder:
-        output.path.mkdir(parents=True, exist_ok=True)
+        cli.make_folder(output.path)
     wanted = list(zip(shots.numbers, paths, strict=True))
     if options.resume:
         wanted = [

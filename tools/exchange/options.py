@@ -53,7 +53,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("input", help="a .kpc file or its http address, or a file of cameras")
     made.add_argument("-o", "--output", required=True, metavar="DIR|FILE", help="what to write; its suffix says which")
     made.add_argument("--format", choices=("ply", "glb"), help="of the files in a folder (default: ply)")
-    add_times(made.add_argument_group("times; of a path, --fps sets the instants per second (default: 24)"))
+    times = made.add_argument_group("times; of a path, --fps sets the instants per second (default: 24)")
+    add_times(times, is_rendering=False)
     _add_geometry(made.add_argument_group("points and meshes"))
     cameras = made.add_argument_group("cameras")
     cameras.add_argument(

@@ -95,13 +95,19 @@ def _add_cameras(group: argparse._ArgumentGroup) -> None:
     )
 
 
-def add_times(group: argparse._ArgumentGroup) -> None:
-    """Add the options that choose frames, which `shots.shots_of` reads."""
+def add_times(group: argparse._ArgumentGroup, is_rendering: bool = True) -> None:
+    """Add the options that choose frames, which `shots.shots_of` reads.
+
+    Args:
+        group: of the parser.
+        is_rendering: whether the texts speak of --cameras and of films, too.
+    """
     group.add_argument(
         "--time",
         type=functools.partial(cli.number_within, low=0.0, high=1.0, name="a number"),
         metavar="T",
-        help="time of all pictures, in [0, 1] over the clip (default: those of --cameras, else the clip plays)",
+        help="stop the clip at this time, in [0, 1] over the clip (default: "
+        + ("those of --cameras, else the clip plays)" if is_rendering else "the clip plays)"),
     )
     group.add_argument(
         "--fps",
@@ -111,15 +117,13 @@ def add_times(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument("--from", dest="start_s", type=cli.time_s, metavar="1.5s", help="begin at this time")
     group.add_argument("--to", dest="end_s", type=cli.time_s, metavar="4s", help="end before this time")
-    group.add_argument(
-        "--frames", type=_range, metavar="A-B", help="render the frames A to B only, counted from 0 at --fps"
-    )
+    group.add_argument("--frames", type=_range, metavar="A-B", help="only the frames A to B, counted from 0 at --fps")
     group.add_argument(
         "--step",
         type=functools.partial(integer, low=1, high=MAX_PICTURES),
         default=1,
         metavar="N",
-        help="render every Nth frame; a film still lasts as long (default: %(default)s)",
+        help="only every Nth frame" + "; a film still lasts as long" * is_rendering + " (default: %(default)s)",
     )
 
 

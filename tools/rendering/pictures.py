@@ -1,7 +1,10 @@
 """The pixels of pictures and films, and the files of pictures."""
 
+import contextlib
 import itertools
-from collections.abc import Callable, Sequence
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -47,16 +50,31 @@ def is_complete(path: Path, camera: Camera, with_depth: bool) -> bool:
     try:
         if not path.is_file():
             return False
-        info = image_info(path)
-        if (info.width, info.height) != (camera.width, camera.height):
-            return False
-        read_image(path)
+        with _without_stderr():
+            info = image_info(path)
+            if (info.width, info.height) != (camera.width, camera.height):
+                return False
+            read_image(path)
         if path.suffix.lower() != ".exr":
             with Image.open(path) as image:
                 image.verify()  # finds an end that is missing
     except (MediaError, OSError, SyntaxError):
         return False
     return not with_depth or path.suffix.lower() == ".exr" or depth_path(path).is_file()
+
+
+@contextlib.contextmanager
+def _without_stderr() -> Iterator[None]:
+    """Discard what the process writes to stderr: OpenEXR reports there what it also raises."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nothing:
+            os.dup2(nothing.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def depth_path(path: Path) -> Path:
