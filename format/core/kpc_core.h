@@ -105,4 +105,20 @@ u32 mark(void);
 void *take(u64 bytes);
 void release(u32 marked);
 
+/* What hosts call. */
+u32 kpc_begin(u32 most, u32 bytes);
+Status kpc_segment(u32 codec, const u8 *body, u32 length, u32 rows, u32 columns, u32 channels, u32 implied, u8 *coded,
+                   i8 *symbols);
+Status kpc_project(const u8 *occupancy, u32 length, u32 plane, u8 *projected);
+Status kpc_implied_map(const u8 *projected, u32 cell_rows, u32 cell_columns, u32 rows, u32 columns, u32 row_start,
+                       u32 row_count, u8 *coded);
+Status kpc_dequantise(const i8 *symbols, u32 texels, u32 channels, const float *step, const float *offset,
+                      float *values);
+Status kpc_motion(const u8 *body, u32 length, u8 *raw, u32 raw_length);
+Status kpc_occupancy(const u8 *body, u32 length, u8 *raw, u32 raw_length);
+Status kpc_weights(u32 is_hybrid, const u8 *body, u32 length, u8 *raw, u32 raw_length);
+Status kpc_poses(const u8 *body, u32 length, u8 *raw, u32 raw_length);
+u32 *kpc_arguments(void);
+void kpc_call(void);
+
 #endif

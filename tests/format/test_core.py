@@ -51,6 +51,12 @@ def table(name: str) -> list[int]:
     return [int(number) for number in re.findall(r"-?\d+", rows)]
 
 
+def test_functions_are_called_by_their_numbers():
+    (names,) = re.findall(r"typedef enum \{ ([A-Z_0-9=, ]+) \} Function;", (FOLDER / "call.c").read_text())
+    numbered = [re.sub(r" = 0", "", name).lower() for name in names.split(", ")]
+    assert [f"kpc_{name}" for name in numbered] == list(core.FUNCTIONS)
+
+
 def test_tables_are_those_of_the_package():
     assert table("OFFSET_SCALE") == transform.OFFSET_SCALES.tolist()
     assert table("COSINE") == transform.COSINES.tolist()
@@ -120,8 +126,9 @@ def test_memory_is_that_of_the_budget(monkeypatch):
 
 def test_what_does_not_end_is_stopped(monkeypatch):
     endless = """(module (memory (export "memory") 1)
-        (func (export "kpc_begin") (param i32 i32) (result i32) i32.const 16)
-        (func (export "kpc_motion") (param i32 i32 i32 i32) (result i32) (loop br 0) unreachable))"""
+        (func (export "kpc_arguments") (result i32) i32.const 16)
+        (func (export "kpc_call") (if (i32.load (i32.const 16)) (then (loop br 0)))
+            (i32.store (i32.const 16) (i32.const 256))))"""  # kpc_begin, whose number is 0, returns an address
     module = wasmtime.Module(core._engine(), endless)
     monkeypatch.setattr(core, "_idle", [])
     monkeypatch.setattr(core, "_compiled", lambda _: module)
