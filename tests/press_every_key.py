@@ -22,6 +22,7 @@ from kpc.player.app.preferences import Preferences
 from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.recording import FILM_FPS
 from kpc.player.app.window import Window
+from kpc.player.cpu import loading
 from kpc.player.quality import DEFAULT, neighbouring_level
 from kpc.player.streaming.group_playback import GroupPlayback
 from player_driver import drag, exact_picture, frames_until, press, replaced
@@ -41,6 +42,7 @@ def main(scene_file: str) -> None:
     opening_asks_for_older_opengl()
     window = Window("test", (320, 240))
     stream = GroupPlayback(open_source(scene_file))
+    loading.load(stream.scene)
     player = Player(window, stream, Preferences(text_size=0.8))
     while not stream.is_settled:
         player.frame()

@@ -133,6 +133,8 @@ class Panels:
         imgui.text_disabled(f"{statistics.samples:.1f} samples per ray, {view.renderer.memory_bytes / 1e6:.0f} MB")
         imgui.text_disabled(view.device.split("(")[0].strip()[:DEVICE_CHARACTERS])
         imgui.text_disabled(f"drawn by {view.renderer.drawn_by}")
+        if view.renderer.is_loading:
+            imgui.text_disabled("faster code is compiled")
         if isinstance(self.state.scene.decoder, HybridDecoder):
             imgui.text_disabled("hybrid decoder (slower)")
         if not stream.is_settled:

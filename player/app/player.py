@@ -36,7 +36,7 @@ SLEEP_S, AWAKE_S = 1.0, 0.6
 MAX_ADVANCE_S = 1.0
 
 # What a window shows until its first picture, and the colour around it.
-OPENING = "Preparing {}. What draws it is compiled the first time, which may take a minute."
+OPENING = "Preparing {}"
 BACKGROUND = 0.06, 0.07, 0.09
 
 

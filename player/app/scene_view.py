@@ -59,7 +59,7 @@ class SceneView:
 
     def make_renderer(self, scene: Scene) -> Renderer:
         """Return a renderer of a scene in this context."""
-        return Renderer(self.ctx, scene, LEVELS[self.state.quality.level])
+        return Renderer(self.ctx, scene, LEVELS[self.state.quality.level], in_background=True)
 
     def resize(self, size: tuple[int, int]) -> None:
         """Replace the canvas by an empty one of `size` pixels."""
@@ -127,6 +127,8 @@ class SceneView:
         self.raster = (width, height)
         # Resizing the canvas's camera keeps the field of view, however the sides of the raster are rounded.
         self._show(self.canvas, self.state.view.camera(*self.canvas.size).resized(width, height))
+        if self.renderer.take_over():
+            self.state.quality.resolution.forget()
 
     def _refine(self) -> None:
         """Draw the next band of rows of a still, from the top, as many rows as take no longer than `band_s`."""

@@ -6,24 +6,17 @@ and linear in between, where the product of three planes is of second degree. Co
 needs them. Figures: docs/design/drawing.md.
 """
 
-import math
-
 import numpy as np
 
 from kpc.format.scene.grid import sample_linear, texel_and_fraction
-from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
+from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Scene
 from kpc.player.atlas import Layout, pad_to_multiple
 from kpc.player.cpu.field_kernels import CornerGridArrays
 from kpc.player.cpu.field_sampler import FieldArrays, FieldSampler, quantised_planes
 from kpc.player.cpu.lanes import Grid
-from kpc.player.cpu.simd import LARGEST, WIDE
+from kpc.player.cpu.serving import WIDE, grid_bytes, grid_shape, serves_grid
+from kpc.player.cpu.simd import LARGEST
 from kpc.player.cpu.threads import WORKERS
-
-# Corners of the largest grid, 64 MB; up to here it saves half of the time and more.
-MOST_CORNERS = 1 << 22
-# Texels that a sample takes of planes from which on the grid pays; below it, reprojection from picture to picture saves
-# more.
-LEAST_TEXELS = 24
 
 
 class CornerGrid(FieldSampler):
@@ -52,21 +45,11 @@ class CornerGrid(FieldSampler):
 
     @staticmethod
     def serves(scene: Scene) -> bool:
-        """Return whether something moves in a box, colour is view-independent, corners are not too many, and channels
-        are many."""
-        is_view_independent = isinstance(scene.decoder, Decoder) and not scene.decoder.w2.any()
-        is_small = math.prod(grid_shape(scene)) <= MOST_CORNERS
-        texels = len(SPACE_PLANES) * sum(-(-scale["xy"].shape[2] // 4) for scale in scene.scales)
-        return (
-            is_view_independent and scene.mapping is None and scene.is_dynamic and is_small and texels >= LEAST_TEXELS
-        )
+        return serves_grid(scene)
 
     @staticmethod
     def bytes_for(scene: Scene) -> int:
-        nz, ny, nx = grid_shape(scene)
-        channels = sum(scale["xy"].shape[2] for scale in scene.scales)
-        channels += -channels % WIDE
-        return (16 + WORKERS) * nz * ny * nx + 2 * channels * (ny * nx + nz * nx + nz * ny)
+        return grid_bytes(scene)
 
     def set_planes(self, atlas: np.ndarray) -> None:
         planes: dict[str, list[np.ndarray]] = {name: [] for name in SPACE_PLANES}
@@ -138,10 +121,3 @@ class CornerGrid(FieldSampler):
         """Resample a (size, ...) array that is corner-aligned along x, y or z to the grid's corners."""
         corners = self._corners[axis]
         return row if len(row) == len(corners) else sample_linear(row, corners)
-
-
-def grid_shape(scene: Scene) -> tuple[int, int, int]:
-    """Return (Nz, Ny, Nx) of the grid: the number of texels of the finest scale along each axis."""
-    return tuple(
-        max(scale[plane].shape[axis] for scale in scene.scales) for plane, axis in (("xz", 0), ("xy", 0), ("xy", 1))
-    )

@@ -119,16 +119,6 @@ class ProcessorRenderer:
         self._count = 0
         self.content: Rectangle = (0, 0, 0, 0)
 
-    @staticmethod
-    def serves(scene: Scene) -> bool:
-        """Return whether the processor's code can draw the scene: not hybrid decoders and device coordinates."""
-        return PlaneSampler.serves(scene)
-
-    @staticmethod
-    def bytes_for(scene: Scene) -> int:
-        """Return the memory that it takes at most, without pictures."""
-        return sum(kind.bytes_for(scene) for kind in (CornerGrid, PlaneSampler) if kind.serves(scene))
-
     @property
     def memory_bytes(self) -> int:
         """Bytes of its arrays without pictures."""

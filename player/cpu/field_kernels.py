@@ -42,7 +42,8 @@ from kpc.player.cpu.lanes import (
     node_strides,
     whole_vectors,
 )
-from kpc.player.cpu.simd import CHANNELS, NARROW, accumulate_features, decode_corner, interpolate
+from kpc.player.cpu.serving import CHANNELS, NARROW
+from kpc.player.cpu.simd import accumulate_features, decode_corner, interpolate
 
 # Flags of a corner: its value is computed; so are those of the seven corners that follow it along x, y and z.
 COMPUTED, CELL_COMPUTED = 1, 2

@@ -10,11 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kpc.jit import compiled
-from kpc.player.cpu.simd import WIDE
+from kpc.player.cpu.serving import LANES, WIDE
 
-# Rays side by side. With 256 a picture takes 1.05 of the time, with 128 1.1; what they hold fits the two nearest
-# caches.
-LANES = 512
 # Corners of a texel or grid cell in three dimensions.
 CORNERS = 8
 

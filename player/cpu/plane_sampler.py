@@ -5,13 +5,12 @@ import math
 import numpy as np
 
 from kpc.format.scene.grid import sample_linear
-from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
-from kpc.format.scene.space import DeviceCoordinates
+from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Scene
 from kpc.player.atlas import Layout, pad_to_multiple
 from kpc.player.cpu.field_kernels import PlaneArrays, log_densities_at
 from kpc.player.cpu.field_sampler import FieldArrays, FieldSampler, quantised_planes
-from kpc.player.cpu.lanes import LANES
-from kpc.player.cpu.simd import CHANNELS, LARGEST, NARROW, WIDE
+from kpc.player.cpu.serving import CHANNELS, LANES, NARROW, group_width, plane_bytes, serves, texels_along
+from kpc.player.cpu.simd import LARGEST
 from kpc.player.cpu.threads import WORKERS
 
 
@@ -26,10 +25,10 @@ class PlaneSampler(FieldSampler):
         super().__init__(scene, layout)
         decoder = scene.decoder
         self._channels = [scale["xy"].shape[2] for scale in scene.scales]
-        self._wide = _group_width(scene)
+        self._wide = group_width(scene)
         groups = [-(-channels // self._wide) for channels in self._channels]
         self._first_group = np.cumsum([0, *groups])
-        self._sizes = np.repeat([_texels_along(scale) for scale in scene.scales], groups, axis=0)
+        self._sizes = np.repeat([texels_along(scale) for scale in scene.scales], groups, axis=0)
         nx, ny, nz = self._sizes.T
         planes, rows = self._wide * np.stack([nx * ny, nx * nz, ny * nz], axis=1), self._wide * self._sizes
         self._firsts = np.concatenate([_offsets(planes), _offsets(rows)], axis=1)
@@ -46,19 +45,11 @@ class PlaneSampler(FieldSampler):
 
     @staticmethod
     def serves(scene: Scene) -> bool:
-        """Return whether the scene has an explicit decoder and no device coordinates."""
-        return isinstance(scene.decoder, Decoder) and not isinstance(scene.mapping, DeviceCoordinates)
+        return serves(scene)
 
     @staticmethod
     def bytes_for(scene: Scene) -> int:
-        taken = 0
-        for scale in scene.scales:
-            nx, ny, nz = _texels_along(scale)
-            channels = scale["xy"].shape[2]
-            channels += -channels % _group_width(scene)
-            planes, rows = 2 * (nx * ny + nx * nz + ny * nz), 4 * (nx + ny + nz)
-            taken += channels * (planes + rows + 4 * CHANNELS * WORKERS * LANES)
-        return taken
+        return plane_bytes(scene)
 
     def set_planes(self, atlas: np.ndarray) -> None:
         steps = []
@@ -110,7 +101,7 @@ class PlaneSampler(FieldSampler):
     def dummy_arrays(scene: Scene) -> FieldArrays:
         flat, table, indices = np.zeros(1, np.float32), np.zeros((1, 1), np.float32), np.zeros((1, 1), np.int64)
         return None, PlaneArrays(
-            tuple(range(0, _group_width(scene), NARROW)), np.zeros(1, np.int16), flat, indices, indices,
+            tuple(range(0, group_width(scene), NARROW)), np.zeros(1, np.int16), flat, indices, indices,
             table, flat, table, flat, np.float32(0), table,
         )  # fmt: skip
 
@@ -130,15 +121,6 @@ class PlaneSampler(FieldSampler):
         whole = np.concatenate(parts, axis=-1).astype(np.float64)
         grouped = whole.reshape(*whole.shape[:-1], whole.shape[-1] // self._wide, self._wide).swapaxes(-3, -2)
         return np.ascontiguousarray(grouped).reshape(*whole.shape[:-2], math.prod(whole.shape[-2:]))
-
-
-def _group_width(scene: Scene) -> int:
-    return NARROW if all(scale["xy"].shape[2] <= NARROW for scale in scene.scales) else WIDE
-
-
-def _texels_along(scale: object) -> tuple[int, int, int]:
-    """Return the number of texels along x, y, z, at least two: a single one is stored twice."""
-    return tuple(max(2, scale[plane].shape[axis]) for plane, axis in (("xy", 1), ("xy", 0), ("xz", 0)))  # type: ignore[index,return-value]
 
 
 def _at_least_two(texels: np.ndarray, axis: int) -> np.ndarray:

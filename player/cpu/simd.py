@@ -15,13 +15,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-# Channels of a grid node, processed at once.
-CHANNELS = 4
-# Features that are stored together: as many floats as the widest processors multiply at once.
-WIDE = 16
-# Features that are processed at once: in halves of WIDE samples take 0.8 of the time, since all operands fit the
-# registers.
-NARROW = 8
+from kpc.player.cpu.serving import CHANNELS, NARROW, WIDE
+
 # Sums are clamped to this.
 LARGEST = 1e30
 

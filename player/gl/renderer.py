@@ -10,7 +10,6 @@ serve, a hybrid decoder or
 
 import math
 import time as clock
-from functools import cache
 from typing import TYPE_CHECKING
 
 import moderngl
@@ -20,6 +19,7 @@ from kpc.format.common.errors import DisplayError
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.atlas import Layout, TimeRows
+from kpc.player.cpu import loading, serving
 from kpc.player.cpu.reference import Part, Rendering, appearance_code
 from kpc.player.footprint import texels_per_pixel
 from kpc.player.gl.folding import UPSAMPLING
@@ -56,18 +56,6 @@ def tries_compute(ctx: moderngl.Context) -> bool:
     return ctx.version_code >= COMPUTE_VERSION and not is_software(ctx)
 
 
-@cache
-def processor_renderer() -> "type[ProcessorRenderer] | None":
-    """Return the processor's renderer; None without numba, which the extras `cpu` and `encoder` bring."""
-    try:
-        from kpc.player.cpu.cpu_renderer import ProcessorRenderer
-    except ModuleNotFoundError as error:
-        if error.name not in ("numba", "llvmlite"):
-            raise
-        return None
-    return ProcessorRenderer
-
-
 class Renderer:
     """A scene that is ready to be drawn.
 
@@ -79,6 +67,7 @@ class Renderer:
             and keep the faster.
         processor: whether the processor's own code draws folded levels, if numba is there; None: where a software
             driver would.
+        in_background: whether shaders draw until `take_over`, which loads the processor's code beside them.
 
     Attributes:
         quality: may be set at any time.
@@ -96,6 +85,7 @@ class Renderer:
         *,
         compute: bool | None = None,
         processor: bool | None = None,
+        in_background: bool = False,
     ) -> None:
         self.ctx, self.scene, self.quality, self.compute = ctx, scene, quality, bool(compute)
         self._pictures_to_trial = TRIAL_AFTER if compute is None and tries_compute(ctx) else math.inf
@@ -105,11 +95,10 @@ class Renderer:
         self._shaders = ShaderRenderer(self._textures, self._programs)
         self._presentation = Presentation(self._textures, self._programs)
         self._processor: ProcessorRenderer | None = None
-        kind = processor_renderer() if (is_software(ctx) if processor is None else processor) else None
-        if kind is not None and kind.serves(scene):
-            self._processor = kind(scene, self.layout, self._textures.read_atlas)
-            if quality.folded:
-                self._processor.warm_up(quality)
+        is_wanted = is_software(ctx) if processor is None else processor
+        self._waits_for_processor = is_wanted and serving.is_installed() and serving.serves(scene)
+        if self._waits_for_processor and (not in_background or loading.is_loaded(scene)):
+            self._make_processor()
         self._targets: dict[tuple[Part, tuple[int, int]], Target] = {}
         self.check()
 
@@ -132,6 +121,26 @@ class Renderer:
         self._processor = None
 
     # --- who draws, and what that takes
+
+    @property
+    def is_loading(self) -> bool:
+        """Whether shaders draw because the processor's code is not loaded yet."""
+        return self._waits_for_processor and self.quality.folded
+
+    def take_over(self) -> bool:
+        """Load the processor's code beside what draws, if that is to draw; return whether it does from here on."""
+        is_ready = self.is_loading and loading.loading_for(self.scene).is_done
+        if is_ready:
+            self._make_processor()
+        return is_ready
+
+    def _make_processor(self) -> None:
+        from kpc.player.cpu.cpu_renderer import ProcessorRenderer
+
+        self._waits_for_processor = False
+        self._processor = ProcessorRenderer(self.scene, self.layout, self._textures.read_atlas)
+        if self.quality.folded:
+            self._processor.warm_up(self.quality)
 
     def _drawing_processor(self) -> "ProcessorRenderer | None":
         """Return the processor's renderer if it draws at this quality."""
@@ -181,9 +190,7 @@ class Renderer:
             texels += 2 * finer.size[0] * finer.size[1] + (1 + UPSAMPLING) * rows
         motion = 0 if scene.motion is None else 16 * int(np.prod(scene.motion.shape[1:4]))
         culling = 4 * int(np.prod([side + 1 for side in scene.occupancy.shape[1:]]))
-        kind = processor_renderer()
-        processor = 0 if kind is None else kind.bytes_for(scene)
-        return 16 * texels + processor + scene.occupancy.nbytes + motion + culling
+        return 16 * texels + serving.bytes_for(scene) + scene.occupancy.nbytes + motion + culling
 
     # --- what changes in the scene
 

@@ -4,7 +4,9 @@
 functions run as plain Python.
 """
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from numba import njit
@@ -36,6 +38,36 @@ def _register() -> None:
 
 
 _register()
+
+
+class NotCachedError(Exception):
+    """A kernel is not in numba's cache."""
+
+
+class _Refusal(event.Listener):  # type: ignore[misc]
+    """Ends compilations as they begin, but for those of the main thread."""
+
+    def on_start(self, event: event.Event) -> None:
+        if threading.current_thread() is not threading.main_thread():
+            raise NotCachedError
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+@contextmanager
+def only_cached() -> Iterator[None]:
+    """Have threads load kernels and not compile them.
+
+    Raises:
+        NotCachedError: where a kernel is not in numba's cache.
+    """
+    refusal = _Refusal()
+    event.register("numba:compile", refusal)
+    try:
+        yield
+    finally:
+        event.unregister("numba:compile", refusal)
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

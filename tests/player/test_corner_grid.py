@@ -8,9 +8,10 @@ import pytest
 import gl
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
-from kpc.player.cpu.corner_grid import MOST_CORNERS, CornerGrid, grid_shape
+from kpc.player.cpu.corner_grid import CornerGrid
 from kpc.player.cpu.field_kernels import COMPUTED
 from kpc.player.cpu.reference import Part, SceneAtTime, features, render
+from kpc.player.cpu.serving import MOST_CORNERS, grid_shape
 from kpc.player.cpu.simd import LARGEST
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LEVELS, Quality

@@ -7,8 +7,8 @@ import pytest
 
 import gl
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, TIME_PLANES, Scene
-from kpc.player.cpu.cpu_renderer import ProcessorRenderer
 from kpc.player.cpu.reference import box_range, render
+from kpc.player.cpu.serving import serves
 from kpc.player.gl import renderer as module
 from kpc.player.gl.renderer import COMPUTE_VERSION, TRIAL_AFTER, Renderer, is_software
 from kpc.player.quality import DEFAULT, LEVELS, Quality, neighbouring_level
@@ -57,7 +57,7 @@ def test_settings_that_draw_nothing_are_refused(name: str, value: float) -> None
 def test_every_level_is_as_near_to_the_reference_as_measured(variant: str, processor: bool) -> None:
     scene = VARIANTS[variant](tiny_scene(4))
     renderer = Renderer(gl.context(), scene, processor=processor)
-    assert (renderer._processor is not None) == (processor and ProcessorRenderer.serves(scene))
+    assert (renderer._processor is not None) == (processor and serves(scene))
     measured = dict(zip(MEASURED_LEVELS, MEASURED[variant], strict=True))
     exact = REFERENCE_DB if is_software(gl.context()) else REFERENCE_ON_A_CARD_DB
     for name, renderer.quality in LEVELS.items():

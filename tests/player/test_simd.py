@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from kpc.player.cpu.simd import LARGEST, NARROW, WIDE, accumulate_features, decode_corner, interpolate
+from kpc.player.cpu.serving import NARROW, WIDE
+from kpc.player.cpu.simd import LARGEST, accumulate_features, decode_corner, interpolate
 
 
 @njit

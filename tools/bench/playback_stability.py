@@ -19,7 +19,9 @@ from kpc.player.app.player import Player
 from kpc.player.app.preferences import Preferences
 from kpc.player.app.resolution_controller import ResolutionController
 from kpc.player.app.window import Window
+from kpc.player.cpu import loading
 from kpc.player.gl import offscreen
+from kpc.player.gl.renderer import is_software
 from kpc.player.streaming.group_playback import GroupPlayback
 
 # The methods of a moderngl context that create an object on the graphics card.
@@ -116,6 +118,8 @@ def in_window(scene: Path, size: tuple[int, int], preferences: Preferences) -> I
         contextlib.closing(GroupPlayback(open_source(str(scene)))) as stream,
     ):
         glfw.swap_interval(0)
+        if is_software(window.ctx):
+            loading.load(stream.scene)
         with contextlib.closing(Player(window, stream, preferences)) as player:
             yield player
 
