@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import time
 
 import pytest
@@ -15,6 +16,7 @@ from kpc.format.container.scene_io import read
 from kpc.tools.vectors import fuzz
 from kpc.tools.vectors.files import encode
 from kpc.tools.vectors.scenes import minimal_scene
+from kpc.tools.vectors.web_reader import WebReader
 
 FEW = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 
@@ -78,6 +80,25 @@ def test_the_command_counts_and_keeps_what_it_finds(monkeypatch, tmp_path, capsy
     said = capsys.readouterr()
     assert json.loads(said.out)["count"] == 3 and "1 of 3 files" in said.err
     assert (tmp_path / "found" / "5-2.kpc").read_bytes() == fuzz.file_number(5, 2, fuzz.seeds())
+
+
+def test_the_browser_player_reads_or_refuses_what_is_damaged(minimal):
+    if shutil.which("node") is None:
+        pytest.skip("needs node")
+    reader, starts = WebReader(fuzz.WEB_BUDGET), fuzz.seeds("minimal,groups,dynamic")
+    try:
+        assert reader.examined(minimal, fuzz.HANG_S) == "read"
+        assert reader.examined(minimal[:-1], fuzz.HANG_S) == "read"  # as far as it goes
+        assert reader.examined(b"not one", fuzz.HANG_S) == "FormatError"
+        said = {reader.examined(fuzz.file_number(1, number, starts), fuzz.HANG_S) for number in range(40)}
+        assert said == {"read", "FormatError"}
+        with pytest.raises(AssertionError, match="took"):
+            reader.examined(minimal, 0.0)
+        reader._process.kill()
+        with pytest.raises((AssertionError, OSError)):
+            reader.examined(minimal, fuzz.HANG_S)
+    finally:
+        reader.close()
 
 
 def test_vectors_by_name():

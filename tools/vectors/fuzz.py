@@ -5,7 +5,8 @@ Conformance vectors are taken apart, mutated, and put together again with every 
 mutations reach the code behind those checks. A reader must read the result or refuse it with a FormatError. Anything
 else that is raised, more than HANG_S of computing and more memory than the budget are findings, which are written to
 -o as files. File number N of a seed is always the same, so that a run may be split: --first 500000 --count 500000 is
-the second half of the one above. `--only transform,motion` mutates just the vectors whose names begin so.
+the second half of the one above. `--only transform,motion` mutates just the vectors whose names begin so. `--reader
+web` lets the browser player read them, under node.
 
 The mutations and the processes that try them are one module because neither is used elsewhere.
 """
@@ -40,8 +41,10 @@ from kpc.format.container.scene_layout import GROUP_KIND
 from kpc.format.scene.scene import ALL_PLANES
 from kpc.tools.vectors import specvectors
 from kpc.tools.vectors.files import ENTRY_FIELDS, HEADER_FIELDS, sealed, with_entry, with_index
+from kpc.tools.vectors.web_reader import WebReader
 
 BUDGET = 32 << 20  # memory budget of the reader in bytes, small enough that what exceeds it shows
+WEB_BUDGET = 48 << 20  # that of the browser player, which counts textures and what its workers take, too
 SLACK = 96 << 20  # bytes that Python, its threads and earlier files may take beside it
 # Seconds of processor time that count as a hang, and after which a process is ended from outside.
 HANG_S, KILL_S = 2.0, 30.0
@@ -354,18 +357,28 @@ def file_number(seed: int, number: int, starts: Sequence[Taken]) -> bytes:
 
 
 def _work(
-    pipe: Connection, now: Any, seed: int, numbers: range, skipped: frozenset[int], budget: int, only: str
+    pipe: Connection,
+    now: Any,
+    seed: int,
+    numbers: range,
+    skipped: frozenset[int],
+    budget: int,
+    only: str,
+    web: bool = False,
 ) -> None:
     """Examine files and send (next number, outcomes, findings) every so often.
 
     Args:
         now: shared with the parent: the number of the current file, and its start in processor time and in wall time.
+        web: whether the browser player reads them.
     """
     warnings.simplefilter("error")
     starts = seeds(only)
-    for taken in starts:
-        examined(taken.together(), budget)  # compiles and imports what is needed
-    _limit_memory(budget + SLACK)
+    reader = WebReader(budget) if web else None
+    if reader is None:
+        for taken in starts:
+            examined(taken.together(), budget)  # compiles and imports what is needed
+        _limit_memory(budget + SLACK)
     tally: Counter[str] = Counter()
     findings: list[tuple[int, str]] = []
     for k, number in enumerate(numbers):
@@ -374,7 +387,7 @@ def _work(
             begun = time.process_time()
             now[:] = number, begun, time.monotonic()
             try:
-                tally[examined(data, budget)] += 1
+                tally[examined(data, budget) if reader is None else reader.examined(data, HANG_S)] += 1
             except Exception as error:  # any exception but a FormatError is a finding
                 tally["finding"] += 1
                 findings.append((number, f"{type(error).__name__}: {error}"))
@@ -415,6 +428,7 @@ def run(
     say: Callable[[str], None] = lambda text: None,
     first: int = 0,
     only: str = "",
+    web: bool = False,
 ) -> dict[str, Any]:
     """Examine `count` files from number `first` on, made of `seeds(only)`; return the outcomes, and findings as
     [number, message].
@@ -427,7 +441,9 @@ def run(
     def begin(numbers: range, skipped: frozenset[int]) -> None:
         ours, theirs = context.Pipe(duplex=False)
         now = context.Array("d", [-1.0, 300.0, time.monotonic()], lock=False)  # the first takes a while
-        process = context.Process(target=_work, args=(theirs, now, seed, numbers, skipped, budget, only), daemon=True)
+        process = context.Process(
+            target=_work, args=(theirs, now, seed, numbers, skipped, budget, only, web), daemon=True
+        )
         process.start()
         theirs.close()
         jobs[ours] = process, now, numbers, skipped
@@ -484,6 +500,9 @@ def _command(argv: list[str]) -> None:
     parser.add_argument("--processes", type=int, default=1, help="at a time (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="other files (default: %(default)s)")
     parser.add_argument("--only", default="", metavar="NAME,...", help="vectors whose names begin so (default: all)")
+    parser.add_argument(
+        "--reader", choices=("python", "web"), default="python", help="which reads them (default: %(default)s)"
+    )
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write what is found here")
     options = parser.parse_args(argv)
     if min(options.count, options.processes) < 1:
@@ -496,9 +515,11 @@ def _command(argv: list[str]) -> None:
         options.count,
         options.seed,
         options.processes,
+        budget=WEB_BUDGET if options.reader == "web" else BUDGET,
         say=lambda text: print(text, file=sys.stderr, flush=True),
         first=options.first,
         only=options.only,
+        web=options.reader == "web",
     )
     if options.output is not None and found["findings"]:
         keep(found["findings"], options.seed, options.output, options.only)

@@ -191,7 +191,7 @@ export class DecoderPool {
 
   /** End the wait for a job of a worker that takes too long. */
   #arm(slot: Slot, job: Job): void {
-    const { deadlineMs = 10_000, deadlineMsPerNumber = 0.01 } = this.#options;
+    const { deadlineMs = 20_000, deadlineMsPerNumber = 0.01 } = this.#options;
     const limit = deadlineMs + deadlineMsPerNumber * job.numbers;
     const due = performance.now() + limit;
     clearTimeout(slot.timer);

@@ -29,8 +29,8 @@ export interface ClipOptions extends Pick<HttpOptions, 'fetch' | 'timeoutMs' | '
   memory?: number;
   /** Ends opening. */
   signal?: AbortSignal;
-  /** The workers; `DecoderPool` says what each option means. */
-  pool?: PoolOptions;
+  /** Workers that other clips use, too, or what to start workers with. */
+  pool?: DecoderPool | PoolOptions;
 }
 
 /** A position in seconds, the speed at which the clip is played (0 while it is paused), and whether it begins again. */
@@ -60,6 +60,7 @@ export class SceneEvent extends Event {
 interface Opened {
   source: Source;
   pool: DecoderPool;
+  ownsPool: boolean;
   timeline: Timeline;
   /** The file of each group. */
   files: Source[];
@@ -114,20 +115,30 @@ export class Clip extends EventTarget {
   /** Open a clip: an address, or a file that the page has. */
   static async open(src: string | URL | Blob | ArrayBuffer, options: ClipOptions = {}): Promise<Clip> {
     const { memory = DEFAULT_MEMORY, signal } = options;
-    const pool = new DecoderPool({ memory: Math.floor(memory / 4), ...options.pool });
+    const ownsPool = !(options.pool instanceof DecoderPool);
+    const pool =
+      options.pool instanceof DecoderPool
+        ? options.pool
+        : new DecoderPool({ memory: Math.floor(memory / 4), ...options.pool });
     pool.warm();
     let source: Source | null = null;
     try {
       source = await sourceOf(src, { ...options, limit: Math.floor(memory / 2) });
-      return await Clip.#open(source, pool, memory, signal);
+      return await Clip.#open(source, pool, ownsPool, memory, signal);
     } catch (error) {
-      pool.close();
+      if (ownsPool) pool.close();
       source?.close();
       throw error;
     }
   }
 
-  static async #open(source: Source, pool: DecoderPool, memory: number, signal?: AbortSignal): Promise<Clip> {
+  static async #open(
+    source: Source,
+    pool: DecoderPool,
+    ownsPool: boolean,
+    memory: number,
+    signal?: AbortSignal,
+  ): Promise<Clip> {
     const container = await openContainer(source, signal);
     const { index, header } = container;
     const chunks = groupChunks(index);
@@ -137,6 +148,7 @@ export class Clip extends EventTarget {
     const opened: Opened = {
       source,
       pool,
+      ownsPool,
       timeline: new Timeline(isSingle ? [{ first: 0, last: 0 }] : groupSpans(index, chunks)),
       files: isSingle
         ? [source]
@@ -174,7 +186,7 @@ export class Clip extends EventTarget {
   /** Set the position: what is fetched, shown and released follows from it. */
   setPlayhead({ time, rate = 0, loop = true }: ClipPosition): void {
     if (this.#isClosed) return;
-    const share = this.duration > 0 ? Math.min(Math.max(time / this.duration, 0), 1) : 0;
+    const share = this.#shareAt(time);
     this.#position = { time: share, rate: this.duration > 0 ? rate / this.duration : 0, loop };
     const { group } = this.timeline.at(share);
     if (this.#next?.group === group && this.#canSwitchTo(this.#next)) this.#switch();
@@ -190,9 +202,9 @@ export class Clip extends EventTarget {
 
   /** Return what makes the picture at a time in seconds, as far as it is held. */
   parts(time: number): ScenePart[] {
-    const share = this.duration > 0 ? time / this.duration : 0;
+    const share = this.#shareAt(time);
     const parts: ScenePart[] = [];
-    for (const part of this.timeline.blendAt(Math.min(Math.max(share, 0), 1))) {
+    for (const part of this.timeline.blendAt(share)) {
       const scene = this.scenes.find(({ group }) => group === part.group);
       if (scene && (scene === this.#shown || scene.holds(part.localTime, part.localTime))) {
         parts.push({ scene, time: part.localTime, share: part.share });
@@ -205,7 +217,7 @@ export class Clip extends EventTarget {
 
   /** Whether the picture at a time in seconds can be drawn; after a wait, only once the next half second is there. */
   canShow(time: number): boolean {
-    const share = this.duration > 0 ? time / this.duration : 0;
+    const share = this.#shareAt(time);
     const { group, localTime } = this.timeline.at(share);
     if (group !== this.#shown.group || !this.#shown.canShow(localTime, this.#headIn(group).rate)) return false;
     return this.error !== null || this.parts(time).length === this.timeline.blendAt(share).length;
@@ -290,7 +302,13 @@ export class Clip extends EventTarget {
       this.dispatchEvent(new SceneEvent('release', scene));
     }
     this.#opened.source.close();
-    this.#opened.pool.close();
+    if (this.#opened.ownsPool) this.#opened.pool.close();
+  }
+
+  /** Return a time in seconds as a share of the clip, whose rate may be anything above 0. */
+  #shareAt(seconds: number): number {
+    const share = seconds / this.duration;
+    return Number.isFinite(share) ? Math.min(Math.max(share, 0), 1) : 0;
   }
 
   #arrived(): void {
