@@ -8,12 +8,8 @@
 import { readFileSync } from 'node:fs';
 import { basename, join } from 'node:path';
 import { chromium } from 'playwright-core';
+import { FLAGS } from './browser_flags.mjs';
 
-const FLAGS = [
-  ...['--headless', '--no-sandbox', '--no-first-run', '--disable-sync'],
-  ...['--disable-background-networking', '--disable-component-update'],
-  ...['--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'],
-];
 const ORIGIN = 'http://localhost';
 
 const [bundle, folder, executablePath] = process.argv.slice(2);

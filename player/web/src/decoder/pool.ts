@@ -43,7 +43,7 @@ interface Job {
 
 interface Slot {
   port: WorkerPort | null;
-  isReady: boolean;
+  state: 'none' | 'starting' | 'ready';
   job: Job | null;
   timer: ReturnType<typeof setTimeout> | undefined;
 }
@@ -64,7 +64,7 @@ export class DecoderPool {
     const { size = defaultSize(), memory = 2 ** 28, workerUrl, spawn } = options;
     this.#options = options;
     this.#memory = memory;
-    this.#slots = Array.from({ length: size }, () => ({ port: null, isReady: false, job: null, timer: undefined }));
+    this.#slots = Array.from({ length: size }, () => ({ port: null, state: 'none', job: null, timer: undefined }));
     this.#spawn = spawn ?? (workerUrl ? spawnFrom(workerUrl) : spawnInline);
     // Beside the module of a site that forbids blobs lies the worker, if all of dist/ has been copied there.
     this.#fallback = spawn || workerUrl ? null : spawnSibling;
@@ -78,7 +78,7 @@ export class DecoderPool {
   /** Start a worker for a task that will come. */
   warm(): void {
     const [slot] = this.#slots;
-    if (slot.port === null && !this.#isClosed) this.#start(slot);
+    if (slot.state === 'none' && !this.#isClosed) this.#start(slot);
   }
 
   /** Tasks that wait or run. */
@@ -127,32 +127,33 @@ export class DecoderPool {
     for (const job of jobs) job?.reject(new KpcError('decoding was ended', 'aborted'));
   }
 
-  /** Give waiting jobs to idle workers, as far as the memory allows. */
+  /** Give waiting jobs to idle workers, as far as the memory allows, and start workers if there are too few. */
   #pump(): void {
     for (const slot of this.#slots) {
       const job = this.#queue[0];
       if (job === undefined) return;
-      if (slot.job !== null) continue;
+      if (slot.state !== 'ready' || slot.job !== null) continue;
       const used = this.#slots.reduce((sum, other) => sum + (other.job ? other.job.numbers * BYTES_PER_NUMBER : 0), 0);
       if (used > 0 && used + job.numbers * BYTES_PER_NUMBER > this.#memory) return;
       this.#queue.shift();
       slot.job = job;
-      if (slot.isReady) this.#send(slot, job);
-      else if (slot.port === null) this.#start(slot);
-      else this.#arm(slot, job);
+      this.#send(slot, job);
     }
+    let missing = this.#queue.length - this.#slots.filter((slot) => slot.state === 'starting').length;
+    for (const slot of this.#slots) if (slot.state === 'none' && missing-- > 0) this.#start(slot);
   }
 
   async #start(slot: Slot): Promise<void> {
+    slot.state = 'starting';
     try {
       const module = await coreModule();
-      if (this.#isClosed || slot.port !== null) return;
+      if (this.#isClosed) return;
       const port = this.#spawn({
         message: (data) => this.#receive(slot, port, data as Answer),
         failed: (reason) => this.#lost(slot, port, reason),
       });
       slot.port = port;
-      if (slot.job) this.#arm(slot, slot.job);
+      this.#arm(slot, 0, () => this.#lost(slot, port, 'it does not start'));
       port.post({ module, memoryLimit: this.#memory }, []);
     } catch (error) {
       this.#lost(slot, slot.port, String(error));
@@ -160,7 +161,11 @@ export class DecoderPool {
   }
 
   #send(slot: Slot, job: Job): void {
-    this.#arm(slot, job);
+    this.#arm(slot, job.numbers, (seconds) => {
+      this.#end(slot);
+      const what = 'number' in job.task ? `chunk ${job.task.number}` : 'the scene';
+      this.#finish(slot)?.reject(new FormatError(`${what} takes longer than ${seconds} s to decode`));
+    });
     try {
       slot.port?.post({ id: job.id, task: job.task }, job.moved);
     } catch (error) {
@@ -171,8 +176,9 @@ export class DecoderPool {
   #receive(slot: Slot, port: WorkerPort, answer: Answer): void {
     if (slot.port !== port) return;
     if ('ready' in answer) {
-      slot.isReady = true;
-      if (slot.job) this.#send(slot, slot.job);
+      clearTimeout(slot.timer);
+      slot.state = 'ready';
+      this.#pump();
     } else if (slot.job?.id === answer.id) {
       const job = this.#finish(slot);
       if ('failure' in answer) job?.reject(rebuilt(answer.failure));
@@ -189,50 +195,48 @@ export class DecoderPool {
     return job;
   }
 
-  /** End the wait for a job of a worker that takes too long. */
-  #arm(slot: Slot, job: Job): void {
+  /** Call a function, with the limit in seconds, when a worker takes too long for something of so many numbers. */
+  #arm(slot: Slot, numbers: number, late: (seconds: number) => void): void {
     const { deadlineMs = 20_000, deadlineMsPerNumber = 0.01 } = this.#options;
-    const limit = deadlineMs + deadlineMsPerNumber * job.numbers;
+    const limit = deadlineMs + deadlineMsPerNumber * numbers;
     const due = performance.now() + limit;
     clearTimeout(slot.timer);
     slot.timer = setTimeout(() => {
       // A timer that is late shows that the page was suspended, and the worker with it.
-      if (performance.now() > due + 1000) return this.#arm(slot, job);
-      this.#end(slot);
-      const what = 'number' in job.task ? `chunk ${job.task.number}` : 'the scene';
-      this.#finish(slot)?.reject(new FormatError(`${what} takes longer than ${limit / 1000} s to decode`));
+      if (performance.now() > due + 1000) this.#arm(slot, numbers, late);
+      else late(limit / 1000);
     }, limit);
   }
 
-  /** Replace a worker that has broken down, or start it in another way if that is why. */
+  /** Let go of a worker that has broken down; if it has not even started, start it in another way. */
   #lost(slot: Slot, port: WorkerPort | null, reason: string): void {
-    if (slot.port !== port) return;
-    const hasStarted = slot.isReady;
+    if (slot.port !== port || this.#isClosed) return;
+    const hasStarted = slot.state === 'ready';
     this.#end(slot);
-    if (!hasStarted && this.#fallback && !this.#isClosed) {
-      this.#spawn = this.#fallback;
-      for (const other of this.#slots) {
-        if (!other.isReady && (other.job || other === slot)) {
-          this.#end(other);
-          this.#start(other);
-        }
-      }
-      this.#fallback = null;
+    if (hasStarted) {
+      this.#finish(slot)?.reject(new KpcError(`the decoder broke down (${reason || 'no reason given'})`, 'worker'));
       return;
     }
-    const advice = hasStarted
-      ? ''
-      : "; the page's Content-Security-Policy must allow worker-src blob: and script-src 'wasm-unsafe-eval'";
-    this.#finish(slot)?.reject(
-      new KpcError(`the decoder cannot run (${reason || 'no reason given'})${advice}`, 'worker'),
-    );
+    if (this.#fallback) {
+      this.#spawn = this.#fallback;
+      this.#fallback = null;
+      this.#start(slot);
+      return;
+    }
+    if (this.#slots.some((other) => other.state !== 'none')) return;
+    const advice = "the page's Content-Security-Policy must allow worker-src blob: and script-src 'wasm-unsafe-eval'";
+    const jobs = this.#queue;
+    this.#queue = [];
+    for (const job of jobs) {
+      job.reject(new KpcError(`the decoder cannot run (${reason || 'no reason given'}); ${advice}`, 'worker'));
+    }
   }
 
   #end(slot: Slot): void {
     clearTimeout(slot.timer);
     slot.port?.terminate();
     slot.port = null;
-    slot.isReady = false;
+    slot.state = 'none';
   }
 }
 
