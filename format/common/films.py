@@ -74,6 +74,13 @@ CODECS = {
         {"preset": "6"},
     ),
 }
+# What sound is encoded as: the codec that players of the container expect.
+SOUND_CODECS = {
+    ".mp4": {"acodec": "aac", "audio_bitrate": "160k"},
+    ".mov": {"acodec": "pcm_s16le"},
+    ".mkv": {"acodec": "libopus", "audio_bitrate": "128k"},
+    ".webm": {"acodec": "libopus", "audio_bitrate": "128k"},
+}
 # The codec of each container if none is asked for.
 DEFAULT_CODECS = {".mp4": "h264", ".mkv": "h264", ".mov": "prores", ".webm": "vp9"}
 
@@ -152,7 +159,13 @@ class FilmFormat:
         return padded_width, padded_height
 
 
-def write_film(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float, film_format: FilmFormat) -> int:
+def write_film(
+    path: str | os.PathLike[str],
+    frames: Iterable[np.ndarray],
+    fps: float,
+    film_format: FilmFormat,
+    sound: Path | None = None,
+) -> int:
     """Encode frames and return their number. The file appears when it is complete.
 
     Odd sides are made even by repeating the last row or column; see `FilmFormat.padded`.
@@ -162,6 +175,7 @@ def write_film(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: 
         frames: (height, width, 3 or 4) uint8 or uint16 R'G'B' and straight alpha.
         fps: frames per second.
         film_format: how to encode them.
+        sound: a WAV file that begins with the first frame.
 
     Raises:
         MediaError: there are no frames, frames differ in size or type, or ffmpeg fails.
@@ -176,7 +190,7 @@ def write_film(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: 
     count = 0
     with atomic_write(path) as temporary, tempfile.TemporaryFile() as log:
         pixels = {(1, 3): "rgb24", (1, 4): "rgba", (2, 3): "rgb48le", (2, 4): "rgba64le"}[first.itemsize, channels]
-        process = _encoder(temporary, pixels, padded, fps, film_format, log)
+        process = _encoder(temporary, pixels, padded, fps, film_format, log, sound)
         assert process.stdin is not None
         try:
             for frame in itertools.chain([first], frames):
@@ -211,21 +225,31 @@ def write_video(
 
 
 def _encoder(
-    path: Path, pixels: str, size: tuple[int, int], fps: float, film_format: FilmFormat, log: IO[bytes]
+    path: Path,
+    pixels: str,
+    size: tuple[int, int],
+    fps: float,
+    film_format: FilmFormat,
+    log: IO[bytes],
+    sound: Path | None,
 ) -> "subprocess.Popen[bytes]":
-    """Start ffmpeg, which encodes raw frames of a pixel format and size from its standard input."""
+    """Start ffmpeg, which encodes raw frames of a pixel format and size from its standard input, and a WAV file."""
     raw = ffmpeg.input("pipe:", format="rawvideo", pix_fmt=pixels, framerate=fps, video_size=size)
     scaled = raw.filter("scale", flags=SCALE_FLAGS, out_color_matrix="bt709", out_range="limited")
     # The encoders take primaries and transfer from the frames alone.
     tagged = scaled.filter("setparams", color_primaries="bt709", color_trc="bt709", colorspace="bt709", range="limited")
     crf = {} if film_format.crf is None else {"crf": film_format.crf}
     faststart = {"movflags": "+faststart"} if path.suffix.lower() in (".mp4", ".mov") else {}
-    stream = tagged.output(
+    heard = {} if sound is None else SOUND_CODECS[path.suffix.lower()]
+    streams = [tagged] if sound is None else [tagged, ffmpeg.input(file_url(sound)).audio]
+    stream = ffmpeg.output(
+        *streams,
         file_url(path),
         vcodec=film_format.encoder,
         pix_fmt=film_format.pix_fmt,
         **crf,
         **faststart,
+        **heard,
         **film_format.options,
     )
     command = stream.global_args("-v", "error", "-y").compile(cmd=ffmpeg_binary())

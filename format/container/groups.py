@@ -282,6 +282,7 @@ class GroupedScene:
     One group is held in memory at a time, or two while they are blended.
 
     Attributes:
+        groups: of the file.
         clip: the time axis of the whole clip.
         cameras: some of the cameras that the first group was captured with.
         metadata: of the clip.
@@ -289,7 +290,7 @@ class GroupedScene:
     """
 
     def __init__(self, groups: Groups) -> None:
-        self._groups = groups
+        self.groups = groups
         self._held: dict[int, Scene] = {}
         self.timeline, self.clip, self.cameras = groups.timeline, groups.clip, groups.cameras()
         self.metadata = groups.metadata()
@@ -317,7 +318,7 @@ class GroupedScene:
         # Release what is no longer needed before another group is read.
         self._held = {held: scene for held, scene in self._held.items() if held in wanted}
         if number not in self._held:
-            scene = read(self._groups.open(number)).dequantise()
+            scene = read(self.groups.open(number)).dequantise()
             self._held[number] = replace(scene, cameras=scene.cameras or self.cameras, metadata=self.metadata)
         return self._held[number]
 

@@ -27,6 +27,7 @@ import numpy as np
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.common.version import VERSION
+from kpc.format.container.clip_sound import has_sound
 from kpc.format.container.groups import Groups, load
 from kpc.format.container.metadata_chunk import META_LIMIT
 from kpc.format.container.metadata_options import add_metadata_options, members_from, with_view_limits
@@ -48,8 +49,10 @@ def _command(argv: list[str]) -> None:
     options = _parser().parse_args(cli.join_values(argv, "--box", "--move", "--up"))
     if options.output.exists() and options.output.samefile(options.scene):
         raise UsageError(f"{options.output}: is the input, too; choose another output with -o")
-    edits = _edits_from(options)
-    metadata = _edited_metadata(Groups(options.scene).metadata(), options)
+    edits, groups = _edits_from(options), Groups(options.scene)
+    if edits.speed is not None and has_sound(groups):
+        print("kpedit: the sound is left out, since it belongs to the speed of the source", file=sys.stderr)
+    metadata = _edited_metadata(groups.metadata(), options)
     if not edits.any:
         size, kept_s = save(with_metadata(options.scene, metadata), options.output), None
     else:
@@ -109,7 +112,7 @@ def _add_edits(parser: argparse.ArgumentParser) -> None:
         help="turn around an axis of the world, x, y or z, counter-clockwise seen from its tip; may be given again",
     )
     parser.add_argument("--move", type=_vector, metavar="X,Y,Z", help="move, after scaling and turning")
-    parser.add_argument("--speed", type=_speed, metavar="F", help="play F times as fast, with the same frames")
+    parser.add_argument("--speed", type=_speed, metavar="F", help="play F times as fast: same frames, no sound")
     parser.add_argument(
         "--fps", type=cli.frame_rate(0.001, 1000.0), metavar="F", help="frames per second, at the same length"
     )

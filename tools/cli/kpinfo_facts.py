@@ -18,6 +18,7 @@ from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.container.sources import open_source
 from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, Clip, HybridDecoder
+from kpc.format.scene.sound import SAMPLE_RATE
 from kpc.format.scene.space import FAR, Contraction, SpaceMapping
 from kpc.format.scene.static import constant_fraction, static_fraction
 from kpc.player.cpu.motion_map import motionless_share
@@ -135,8 +136,19 @@ def _group(groups: Groups, number: int) -> dict[str, Any]:
         "value_count": head.value_count if head else None,
         "scale_count": len(head.scales) if head else None,
         "is_dynamic": head.is_dynamic if head else None,
+        "sound": _sound(groups.open(number)) if head else None,
         "scene": None,
     }
+
+
+def _sound(reader: SceneReader) -> dict[str, Any] | None:
+    """Return what the index and the first soun chunk say; None without one, or where it is missing."""
+    numbers = reader.sound_numbers
+    if not numbers or not reader.available(numbers[0]):
+        return None
+    first, size = reader.sound_segment(numbers[0]), sum(reader.index[number].stored_length for number in numbers)
+    duration_s = first.sample_count / SAMPLE_RATE
+    return {"channels": first.channels, "duration_s": duration_s, "stored_bytes": size}
 
 
 def _verify(groups: Groups, numbers: Sequence[int], info: dict[str, Any]) -> None:
@@ -191,7 +203,7 @@ def _damaged_chunks(reader: SceneReader) -> list[tuple[int, str, FormatError]]:
             damaged.append((number, entry.kind, error))
     if not damaged:
         reader.mapping(), reader.motion(), reader.decoder(), reader.occupancy()
-        reader.cameras(), reader.appearances(), reader.metadata()
+        reader.cameras(), reader.appearances(), reader.metadata(), reader.sound()
     return damaged
 
 

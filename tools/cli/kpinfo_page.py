@@ -28,7 +28,8 @@ def page(info: Mapping[str, Any]) -> str:
     for label, text in metadata_rows(Metadata(info["metadata"]), sizes):
         lines += _item(label, printable(text))
     if described is None:
-        return "\n".join([*lines, *_item("clip", _clip(info)), *_item("cameras", str(info["cameras"])), *_groups(info)])
+        lines += _item("clip", _clip(info)) + _sound(info["groups"]) + _item("cameras", str(info["cameras"]))
+        return "\n".join([*lines, *_groups(info)])
     if len(info["groups"]) > 1:
         since, until = described["shown_s"]
         frames = "frames {}-{}".format(*described["frames"])
@@ -36,6 +37,7 @@ def page(info: Mapping[str, Any]) -> str:
         lines += _item(f"group {described['number']}", f"{frames}, shown from {since:.2f} to {until:.2f} s")
     else:
         lines += _item("clip", _clip(info))
+    lines += _sound([described])
     scene = described["scene"]
     whole = info["expected_bytes"] if len(info["groups"]) == 1 else described["stored_bytes"]
     return "\n".join([*lines, *_scene_lines(scene), "", *_chunk_lines(scene, whole)])
@@ -91,6 +93,18 @@ def _clip(info: Mapping[str, Any]) -> str:
         parts = [f"{parts[0]} at {clip['fps']:g} fps", f"{clip['duration_s']:.2f} s"]
     parts.append(f"in {counted(groups, 'group')}" if groups > 1 else "dynamic" if clip["is_dynamic"] else "static")
     return ", ".join(parts)
+
+
+def _sound(groups: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a line about the sound of some groups; none if they are silent."""
+    sounds = [group["sound"] for group in groups if group["sound"] is not None]
+    if not sounds:
+        return []
+    size, duration_s = (sum(sound[name] for sound in sounds) for name in ("stored_bytes", "duration_s"))
+    kind = "mono" if all(sound["channels"] == 1 for sound in sounds) else "stereo"
+    some = f", in {len(sounds)} of {len(groups)} groups" if len(sounds) < len(groups) else ""
+    text = f"Opus, {kind}, {duration_s:.2f} s{some}, {size:,} bytes, {size / duration_s:,.0f} a second"
+    return _item("sound", text)
 
 
 def _groups(info: Mapping[str, Any]) -> list[str]:

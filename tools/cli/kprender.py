@@ -19,8 +19,10 @@ import errno
 import functools
 import os
 import sys
+import tempfile
 import time as clock
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -36,6 +38,7 @@ from kpc.tools.rendering.content import mean_picture, renderer_of
 from kpc.tools.rendering.options import MAX_SIDE, parser
 from kpc.tools.rendering.outputs import Output
 from kpc.tools.rendering.shots import Shots, shots_of
+from kpc.tools.rendering.sound import write_sound
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -66,7 +69,11 @@ def _command(argv: list[str]) -> None:
 
     started = clock.monotonic()
     if film is not None:
-        what = _write_film(output, film, shots, picture, scene, options)
+        with tempfile.TemporaryDirectory() as folder:
+            sound = Path(folder) / "sound.wav"
+            if reason := write_sound(sound, loaded, shots):
+                _say(reason)
+            what = _write_film(output, film, shots, picture, scene, options, sound if sound.exists() else None)
     else:
         what = _write_pictures(output, shots, picture, scene, options, is_transparent)
     camera = shots.camera(shots.numbers[0])
@@ -134,6 +141,7 @@ def _write_film(
     picture: Callable[[int], Rendering],
     scene: Scene,
     options: argparse.Namespace,
+    sound: Path | None,
 ) -> str:
     """Render and encode a film; return what was written."""
     camera = shots.camera(shots.numbers[0])
@@ -146,9 +154,10 @@ def _write_film(
     else:
         pixels = functools.partial(pictures.colour_pixels, is_transparent=film.has_alpha, bits=film.bits)
     frames = (pixels(picture(number)) for number in progress(shots.numbers, output.path.name, unit="frames"))
-    write_film(output.path, frames, shots.fps, film)
+    write_film(output.path, frames, shots.fps, film, sound)
     size = "" if padded == (camera.width, camera.height) else f" (padded to {padded[0]}x{padded[1]})"
-    return f"{output.path}: {len(shots)} frame{'s' * (len(shots) != 1)} at {shots.fps:g} fps{size}"
+    heard = "" if sound is None else ", with sound"
+    return f"{output.path}: {len(shots)} frame{'s' * (len(shots) != 1)} at {shots.fps:g} fps{heard}{size}"
 
 
 def _write_pictures(

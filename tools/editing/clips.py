@@ -106,7 +106,8 @@ def _edit_groups(
     for number, span in zip(numbers, spans, strict=True):
 
         def change(scene: QuantisedScene, span: Span = span) -> QuantisedScene:
-            return replace(_changed(scene, edits), clip=Clip(span.count, edits.fps or fps))
+            sound = scene.sound if edits.speed is None else None
+            return replace(_changed(scene, edits), clip=Clip(span.count, edits.fps or fps), sound=sound)
 
         parts.append(groups.GroupInput.of(edited(clip.open(number), change), span.start))
     return groups.write(parts, output, metadata), kept

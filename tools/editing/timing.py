@@ -18,12 +18,13 @@ from kpc.format.container.groups import Span
 from kpc.format.container.scene_layout import AXIS_LIMIT
 from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.scene.scene import TIME_PLANES, Clip
+from kpc.format.scene.sound import SAMPLE_RATE
 from kpc.tools.editing.unread import without_unread
 
 
 def at_speed(scene: QuantisedScene, factor: float) -> QuantisedScene:
-    """Return a clip that runs `factor` times as fast, with the same frames."""
-    return replace(scene, clip=Clip(scene.clip.frame_count, scene.clip.fps * factor))
+    """Return a clip that runs `factor` times as fast, with the same frames and no sound."""
+    return replace(scene, clip=Clip(scene.clip.frame_count, scene.clip.fps * factor), sound=None)
 
 
 def at_rate(scene: QuantisedScene, fps: float) -> QuantisedScene:
@@ -90,9 +91,13 @@ def trimmed(scene: QuantisedScene, start_s: float, end_s: float) -> tuple[Quanti
         return scene, (0.0, duration_s)
     since_s, until_s = (row / parts * duration_s for row in (first, last))
     frames = max(1, round((until_s - since_s) * scene.clip.fps))
+    sound, fps = scene.sound, frames / (until_s - since_s)
+    if sound is not None:
+        sound = sound.part(round(since_s * SAMPLE_RATE), round((frames + 1) / fps * SAMPLE_RATE))
     part = replace(
         scene,
-        clip=Clip(frames + 1, frames / (until_s - since_s)),
+        clip=Clip(frames + 1, fps),
+        sound=sound,
         scales=tuple(
             {n: _rows(plane, first, last, parts) if n in TIME_PLANES else plane for n, plane in scale.items()}
             for scale in scene.scales

@@ -1,0 +1,1 @@
+"""The sound of a clip: decoding it, and playing it in step with the pictures."""
