@@ -1,4 +1,4 @@
-"""Clips load in headless Chromium, under Content-Security-Policies and from other sites (player/web/tests/loading.mjs)."""
+"""Clips load in headless Chromium, whatever the page permits, and from other sites (player/web/tests/loading.mjs)."""
 
 import json
 import subprocess

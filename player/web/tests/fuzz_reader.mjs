@@ -5,30 +5,31 @@
  */
 
 import { readFileSync } from 'node:fs';
-import { Worker } from 'node:worker_threads';
 import { Clip, DecoderPool, KpcError } from '../dist/kpc-player.js';
 
 const MEMORY = Number(process.argv[2]);
-/** Long, since a busy machine is no finding: computing is measured. */
-const DEADLINE_MS = 60_000;
 /** Errors that no file should cause. */
 const STRANGE = ['worker', 'aborted', 'network', 'not-found', 'blocked', 'replaced'];
 
-const PRELUDE = `
-const { parentPort } = require('node:worker_threads');
-globalThis.postMessage = (message, moved) => parentPort.postMessage(message, moved);
-parentPort.on('message', (data) => globalThis.onmessage({ data }));
-`;
-const script = PRELUDE + readFileSync(new URL('../dist/kpc-worker.js', import.meta.url), 'utf-8');
+const script = readFileSync(new URL('../dist/kpc-worker.js', import.meta.url), 'utf-8');
 
+/** Run the worker's script in this thread: what it does with a file is the same, and its time is counted. */
 function spawn(listener) {
-  const worker = new Worker(script, { eval: true });
-  worker.on('message', listener.message);
-  worker.on('error', (error) => listener.failed(String(error)));
-  return { post: (message, moved) => worker.postMessage(message, moved), terminate: () => worker.terminate() };
+  const scope = {
+    postMessage: (message, moved) => {
+      const copy = structuredClone(message, { transfer: moved });
+      setImmediate(() => listener.message(copy));
+    },
+  };
+  new Function('globalThis', script)(scope);
+  const post = (message, moved) => {
+    const data = 'module' in message ? message : structuredClone(message, { transfer: moved });
+    setImmediate(() => scope.onmessage({ data }));
+  };
+  return { post, terminate: () => {} };
 }
 
-const pool = new DecoderPool({ size: 1, spawn, memory: MEMORY / 4, deadlineMs: DEADLINE_MS, deadlineMsPerNumber: 0 });
+const pool = new DecoderPool({ size: 1, spawn, memory: MEMORY / 4 });
 
 /** Play a file at some times, and take all that comes. */
 async function play(bytes) {
@@ -65,7 +66,6 @@ async function examine(bytes) {
   } catch (error) {
     const isRefusal = error instanceof KpcError && !STRANGE.includes(error.code);
     if (!isRefusal) return { finding: error.stack ?? String(error) };
-    if (error.message.includes('takes longer than')) return { finding: error.message };
     said = error.name;
   }
   const { user, system } = process.cpuUsage(before);

@@ -15,7 +15,7 @@ import { type HttpOptions, HttpSource } from './http.js';
 import { openContainer } from './opening.js';
 import type { Playhead } from './prefetch.js';
 import { SceneStream } from './scene_stream.js';
-import { BlobSource, SlicedSource, type Source } from './source.js';
+import { BlobSource, BytesSource, SlicedSource, type Source } from './source.js';
 
 /** The memory that a clip may take where the page does not say. */
 export const DEFAULT_MEMORY = 2 ** 29;
@@ -382,7 +382,7 @@ export class Clip extends EventTarget {
 
 async function sourceOf(src: string | URL | Blob | ArrayBuffer, options: HttpOptions): Promise<Source> {
   if (src instanceof Blob) return new BlobSource(src);
-  if (src instanceof ArrayBuffer) return new BlobSource(new Blob([src]));
+  if (src instanceof ArrayBuffer) return new BytesSource(new Uint8Array(src));
   let url: URL;
   try {
     url = new URL(src, globalThis.document?.baseURI);

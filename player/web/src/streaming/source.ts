@@ -47,6 +47,28 @@ export class BlobSource implements Source {
   close(): void {}
 }
 
+/** A file in memory. */
+export class BytesSource implements Source {
+  readonly name = 'the file';
+  readonly size: number;
+  readonly receivedBytes: number;
+  readonly memoryBytes: number;
+  readonly #bytes: Uint8Array;
+
+  constructor(bytes: Uint8Array) {
+    this.#bytes = bytes;
+    this.size = this.receivedBytes = this.memoryBytes = bytes.length;
+  }
+
+  async read(start: number, end: number, { arrived }: ReadOptions = {}): Promise<Uint8Array> {
+    const bytes = this.#bytes.subarray(start, end);
+    arrived?.(bytes);
+    return bytes;
+  }
+
+  close(): void {}
+}
+
 /** A file within a file: a group of a clip. */
 export class SlicedSource implements Source {
   readonly name: string;
