@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from kpc.format.common.errors import FormatError
 from kpc.format.container.scene_io import read
-from kpc.tools.vectors import fuzz
+from kpc.tools.vectors import fuzz, fuzz_bodies
 from kpc.tools.vectors.files import encode
 from kpc.tools.vectors.scenes import minimal_scene
 from kpc.tools.vectors.web_reader import WebReader
@@ -161,3 +161,30 @@ def test_a_frame_that_says_it_is_vast_is_not_taken_at_its_word() -> None:
     )
     assert fuzz._decompressed(small) == b"a" * 100
     assert fuzz._decompressed(vast) is None and fuzz._decompressed(b"no frame") is None
+
+
+def test_bodies_are_decoded_or_refused():
+    """The bodies of every codec; each is decoded without a mutation, and number N of a seed is always the same."""
+    starts = fuzz_bodies.bodies()
+    assert {start.name.split()[-1] for start in starts} == {"PLNE", *fuzz_bodies.FUNCTIONS}
+    for start in starts:
+        start.decode(start.stored)
+    found = fuzz_bodies.run(300, seed=2)
+    assert found["count"] == 300 == sum(found["outcomes"].values()) and not found["findings"]
+    assert found["outcomes"]["decoded"] > 20
+    assert fuzz_bodies.body_number(2, 7, starts)[1] == fuzz_bodies.body_number(2, 7, starts)[1]
+
+
+def test_what_is_wrong_with_bodies_is_found(monkeypatch, tmp_path, capsys):
+    def hangs(body: bytes) -> None:
+        monkeypatch.setattr(fuzz_bodies.time, "process_time", lambda: 10.0)
+
+    def breaks(body: bytes) -> None:
+        monkeypatch.setattr(fuzz_bodies.time, "process_time", lambda: 0.0)
+        raise ValueError("as it should not")
+
+    monkeypatch.setattr(fuzz_bodies.time, "process_time", lambda: 0.0)
+    for decode, message in ((breaks, "ValueError: as it should not"), (hangs, "took 10.0 s")):
+        monkeypatch.setattr(fuzz_bodies, "bodies", lambda d=decode: [fuzz_bodies.Body("a", b"abc", d)])
+        assert fuzz_bodies.main(["--count", "1", "-o", str(tmp_path)]) == 1
+        assert f"a: {message}" in capsys.readouterr().out and (tmp_path / "0-0.body").is_file()
