@@ -10,6 +10,7 @@ import type { Core } from '../src/decoder/core.js';
 import { loadCore } from '../src/decoder/module.js';
 import type { DecoderPool } from '../src/decoder/pool.js';
 import { dequantised, needsOccupancy } from '../src/decoder/segment.js';
+import type { Spawn } from '../src/decoder/spawn.js';
 import type { SegmentTask } from '../src/decoder/tasks.js';
 import { layerTexels, toHalf } from '../src/decoder/texels.js';
 import { read } from './files.js';
@@ -115,36 +116,29 @@ test('what takes more than the budget is refused, and what fits runs alone', asy
   await withPool({ memory: 5 * numbers }, async (pool) => {
     await assert.rejects(pool.run(segmentTask(PLANES[0]), { numbers: numbers + 1 }), hasCode('budget'));
   });
-  let running = 0;
-  let most = 0;
-  const counting = spawnScript(`onmessage = ({ data }) =>
-    data.module ? postMessage({ ready: true }) : setTimeout(() => postMessage({ id: data.id, result: null }), 20);`);
-  const spawn: typeof counting = (listener) => {
-    const port = counting({
-      ...listener,
-      message: (data) => {
-        if (typeof data === 'object' && data && 'id' in data) running--;
-        listener.message(data);
-      },
-    });
-    return {
-      ...port,
-      post: (message, moved) => {
-        if (typeof message === 'object' && message && 'id' in message) most = Math.max(most, ++running);
-        port.post(message, moved);
-      },
-    };
-  };
   for (const [share, expected] of [
     [0.9, 1],
-    [0.3, 2],
+    [0.3, 3],
   ] as const) {
-    most = 0;
-    await withPool({ spawn, memory: 5 * numbers }, async (pool) => {
-      const task = segmentTask(PLANES[0]);
-      await Promise.all([1, 2, 3, 4].map(() => pool.run(task, { numbers: share * numbers })));
+    const running: (() => void)[] = [];
+    const spawn: Spawn = (listener) => ({
+      post: (message) => {
+        const { id } = message as { id?: number };
+        if (id === undefined) queueMicrotask(() => listener.message({ ready: true }));
+        else running.push(() => listener.message({ id, result: null }));
+      },
+      terminate: () => {},
     });
-    assert.equal(most, expected);
+    await withPool({ size: 4, spawn, memory: 5 * numbers }, async (pool) => {
+      const jobs = [1, 2, 3, 4].map(() => pool.run(segmentTask(PLANES[0]), { numbers: share * numbers }));
+      for (let left = 4; left > 0; left--) {
+        while (running.length < Math.min(left, expected)) await new Promise(setImmediate);
+        await new Promise(setImmediate);
+        assert.equal(running.length, Math.min(left, expected));
+        running.shift()?.();
+      }
+      await Promise.all(jobs);
+    });
   }
 });
 
