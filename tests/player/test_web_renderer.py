@@ -91,6 +91,8 @@ SHOTS = [
 LEAST_DB = {"fastest": 20, "faster": 20, "fast": 20, "balanced": 46, "fine": 50, "finer": 52, "auto": 50}
 LEVEL_SHOTS = [Shot(name, level) for name in ("box", "hybrid", "contracted") for level in LEAST_DB]
 ALL = SHOTS + LEVEL_SHOTS
+# What is drawn before and after the context is lost.
+LOST = Shot("displaced", "fine")
 
 
 def clip_in_groups(folder: Path) -> bytes:
@@ -110,12 +112,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def results(files: dict[str, bytes], tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
-    """Return what the page says: pictures of ALL, shaders of SCENES, the table of levels, objects left in the end."""
+    """Return what the page says: pictures of ALL, shaders of SCENES, two pictures of LOST, the table of levels, and
+    objects left in the end."""
     calls = [shot.call for shot in ALL]
     for name in SCENES:
         calls += [("shaders", [Shot(name).call[1][0], FRAGMENTS, defines]) for defines in DEFINES]
     served = {shot.file: files[shot.scene] for shot in ALL}
-    return web_page.run(tmp_path_factory.mktemp("page"), served, [*calls, ("levels", []), ("close", [])])
+    calls += [("lost", LOST.call[1]), ("levels", []), ("close", [])]
+    return web_page.run(tmp_path_factory.mktemp("page"), served, calls)
 
 
 def reference_of(shot: Shot, data: bytes) -> np.ndarray:
@@ -167,6 +171,11 @@ def test_the_levels_are_those_of_the_desktop(results: list[Any]) -> None:
     assert list(results[-2]) == list(LEVELS)
     for level, quality in results[-2].items():
         assert quality == {name: getattr(LEVELS[level], field) for name, field in names.items()}
+
+
+def test_a_lost_context_comes_back(results: list[Any]) -> None:
+    before, after = results[-3]
+    assert before["pixels"] == after["pixels"] and after["error"] == 0
 
 
 def test_nothing_is_left_on_the_card(results: list[Any]) -> None:

@@ -9,6 +9,7 @@
     kpbench stream room.kpc liam.kpc --out docs/bench/stream.json
     kpbench window room.kpc liam.kpc --out docs/bench/window.json
     kpbench steady room.kpc liam.kpc --out docs/bench/steady.json
+    kpbench web room.kpc liam.kpc --out docs/bench/web.json
     kpbench codec room.kpck liam.kpc --dataset room --dataset liam --out docs/bench/codec.json
     kpbench entropy room.kpc liam.kpc --out docs/bench/entropy.json
     kpbench decode room.kpc liam.kpc --out docs/bench/decode.json
@@ -69,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     kinds = parser.add_subparsers(
         dest="kind",
         required=True,
-        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|codec|entropy|decode",
+        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|web|codec|entropy|decode",
     )
     for module in (encoding_commands, playing_commands, coding_commands):
         module.add_parsers(kinds)

@@ -1,4 +1,4 @@
-"""The subcommands of kpbench that play: player, stream, window and steady."""
+"""The subcommands of kpbench that play: player, stream, window, steady and web."""
 
 import argparse
 import sys
@@ -8,7 +8,7 @@ from typing import Any
 
 from kpc.format.container import scene_io
 from kpc.player.quality import DEFAULT, LEVELS
-from kpc.tools.bench import harness, pacing, playback_stability, player_bench, streaming_bench
+from kpc.tools.bench import harness, pacing, playback_stability, player_bench, streaming_bench, web_bench
 from kpc.tools.bench.harness import size_text
 from kpc.tools.bench.records import Record
 
@@ -68,6 +68,23 @@ def add_parsers(kinds: Any) -> None:
     )
     steady.set_defaults(measure=_steady)
     harness.add_repeats((player, stream, window, steady))
+
+    web = kinds.add_parser(
+        "web",
+        help="what pictures in a browser look up, and how near they are to the reference",
+        description="Draw each scene in headless Chromium by a software driver, count what pictures look up, and say "
+        "which frame rate follows for graphics cards of several speeds. Needs a checkout, node and Chromium.",
+    )
+    harness.add_scenes(web)
+    web.add_argument(
+        "--size",
+        type=harness.picture_size,
+        nargs="+",
+        default=[(320, 240), (1280, 720), (1920, 1080)],
+        metavar="WxH",
+        help="sizes of a picture; the software driver is timed at the first (default: 320x240 1280x720 1920x1080)",
+    )
+    web.set_defaults(measure=_web)
 
 
 def _player(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
@@ -130,6 +147,18 @@ def _steady(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
         )
         job = playback_stability.LongPlay(source, options.size, options.frames)
         yield _in_window(record, options.repeats, playback_stability.measure, job)
+
+
+def _web(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
+    """Yield a record for each scene, size, and level or what `auto` makes of one."""
+    for source in options.scenes:
+        for number, size in enumerate(options.size):
+            record = harness.new_record("web", source, origin, {})
+            print(f"kpbench: {record['name']}, {size_text(size)}", file=sys.stderr)
+            renderer, found = web_bench.measure(web_bench.Drawing(source, size, is_timed=number == 0))
+            for (level, scale), measured in found.items():
+                settings = {"quality": level, "scale": scale, "size": size_text(size), "devices": web_bench.DEVICES}
+                yield record | {"seed": None, "renderer": renderer, "settings": settings, "repeats": [measured]}
 
 
 def _in_window(record: Record, repeats: int, measure: Callable[[Any], Record], job: object) -> Record:

@@ -1,21 +1,20 @@
 /** A page that draws scenes on demand, for tests and benches in a real browser; `browser.mjs` drives it. */
 
-import { Groups } from '../src/container/groups.js';
-import { Core } from '../src/decoder/core.js';
 import { Layout } from '../src/render/atlas.js';
-import type { Camera } from '../src/render/camera.js';
+import { type Camera, texelsPerPixel } from '../src/render/camera.js';
 import type { DrawnScene } from '../src/render/drawn_scene.js';
-import type { Rung } from '../src/render/pace.js';
+import { costOf, Pace, type Rung, rungsOf } from '../src/render/pace.js';
 import type { Moment, ShownPart } from '../src/render/picture_job.js';
 import { LEVELS, type Level } from '../src/render/quality.js';
-import { Renderer } from '../src/render/renderer.js';
+import { type DrawnPicture, FIRST_RAYS, Renderer } from '../src/render/renderer.js';
 import { sceneDefines } from '../src/render/scene_textures.js';
 import { type Composed, compose, constants, type Defines } from '../src/render/shader.js';
 import { blockArrays, decoderArrays } from '../src/render/shader_constants.js';
-import { sourceOf } from './scene_source.js';
+import { Clip, type SceneEvent } from '../src/streaming/clip.js';
+import type { SceneStream } from '../src/streaming/scene_stream.js';
 
 /** A picture to draw. */
-export interface Job {
+interface Job {
   file: string;
   camera: Camera;
   time: number; // in [0, 1] of the clip
@@ -26,45 +25,71 @@ export interface Job {
 }
 
 interface Opened {
-  groups: Groups;
+  clip: Clip;
   renderer: Renderer;
-  scenes: Map<number, DrawnScene>;
+  scenes: Map<SceneStream, DrawnScene>;
 }
+
+/** Frames after which a choice on a device of constant speed no longer changes. */
+const CHOOSING_FRAMES = 500;
 
 const opened = new Map<string, Opened>();
-let core: Core | null = null;
-
-async function bytesOf(path: string): Promise<Uint8Array<ArrayBuffer>> {
-  return new Uint8Array(await (await fetch(path)).arrayBuffer());
-}
+const pause = (ms: number) => new Promise((resolve) => setTimeout(resolve, ms));
 
 async function open({ file, camera, halfFloat = false }: Job): Promise<Opened> {
   const known = opened.get(file);
   if (known) return known;
-  core ??= new Core(await WebAssembly.compile(await bytesOf('/kpc_core.wasm')));
-  const groups = new Groups(await bytesOf(`/${file}`), core);
-  const canvas = new OffscreenCanvas(camera.width, camera.height);
-  const found = { groups, renderer: new Renderer(canvas, { halfFloat }), scenes: new Map() };
+  const clip = await Clip.open(await (await fetch(`/${file}`)).arrayBuffer(), { pool: { size: 1 } });
+  const renderer = new Renderer(new OffscreenCanvas(camera.width, camera.height), { halfFloat });
+  const scenes = new Map(clip.scenes.map((scene) => [scene, renderer.addScene(scene)]));
+  clip.addEventListener('open', (event) => {
+    const { scene } = event as SceneEvent;
+    scenes.set(scene, renderer.addScene(scene));
+  });
+  clip.addEventListener('release', (event) => {
+    const drawn = scenes.get((event as SceneEvent).scene);
+    if (drawn) renderer.removeScene(drawn);
+  });
+  const found = { clip, renderer, scenes };
   opened.set(file, found);
   return found;
 }
 
-function sceneOf({ groups, renderer, scenes }: Opened, number: number): DrawnScene {
-  const known = scenes.get(number);
-  if (known) return known;
-  const drawn = renderer.addScene(sourceOf(groups.open(number)));
-  scenes.set(number, drawn);
-  return drawn;
+/** Open what a job needs, and return how to draw it. */
+async function prepared(job: Job) {
+  const { clip, renderer, scenes } = await open(job);
+  const { canvas } = renderer.gl;
+  if (canvas.width !== job.camera.width || canvas.height !== job.camera.height) {
+    [canvas.width, canvas.height] = [job.camera.width, job.camera.height];
+  }
+  const time = job.time * clip.duration;
+  clip.setPlayhead({ time });
+  const moments = (): Moment[] =>
+    clip.parts(time).map((part) => ({ ...part, scene: scenes.get(part.scene) as DrawnScene }));
+  const appearance = clip.scenes[0].appearances.find(({ name }) => name === job.appearance)?.embedding ?? null;
+  const options = { level: job.level, part: job.part, appearance };
+  return { clip, renderer, moments, options, parts: clip.timeline.blendAt(job.time).length };
 }
 
-const pause = (ms: number) => new Promise((resolve) => setTimeout(resolve, ms));
+/** Draw until all has arrived and the picture is sharp. */
+async function drawn(job: Job) {
+  const { clip, renderer, moments, options, parts } = await prepared(job);
+  for (let isDone = false; !isDone; await pause(1)) {
+    clip.setPlayhead({ time: job.time * clip.duration });
+    const { isSharp } = renderer.draw(job.camera, moments(), options);
+    isDone = isSharp && clip.isSettled && moments().length === parts;
+  }
+  return renderer;
+}
 
 /** Wait until the card has drawn all. */
-async function finished(gl: WebGL2RenderingContext): Promise<void> {
+async function finished(renderer: Renderer): Promise<void> {
+  const { gl } = renderer;
   const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0) as WebGLSync;
   gl.flush();
   while (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) await pause(0);
   gl.deleteSync(fence);
+  while (renderer.isBusy) await pause(0);
 }
 
 function base64(bytes: Uint8Array): string {
@@ -73,67 +98,103 @@ function base64(bytes: Uint8Array): string {
   return btoa(text);
 }
 
-async function prepared(job: Job) {
-  const found = await open(job);
-  const moments: Moment[] = found.groups.timeline.blendAt(job.time).map(({ group, localTime, share }) => ({
-    scene: sceneOf(found, group),
-    time: localTime,
-    share,
-  }));
-  const { gl } = found.renderer;
-  if (gl.canvas.width !== job.camera.width || gl.canvas.height !== job.camera.height) {
-    [gl.canvas.width, gl.canvas.height] = [job.camera.width, job.camera.height];
-  }
-  const known = found.groups.first.appearances.find(({ name }) => name === job.appearance);
-  return { ...found, moments, appearance: known?.embedding ?? null };
-}
-
 const page = {
   /** Draw a picture until it is sharp; return its bytes RGBA, rows from below, in base64. */
   async picture(job: Job) {
-    const { renderer, moments, appearance } = await prepared(job);
+    const renderer = await drawn(job);
     const { gl } = renderer;
-    const versions = () => moments.map(({ scene }) => scene.version).join();
-    const [width, height] = [job.camera.width, job.camera.height];
+    const { width, height } = job.camera;
     const pixels = new Uint8Array(4 * width * height);
-    for (let before = '', isSharp = false; !isSharp || versions() !== before; await pause(1)) {
-      before = versions();
-      ({ isSharp } = renderer.draw(job.camera, moments, { level: job.level, part: job.part, appearance }));
-    }
     renderer.present();
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
     return { pixels: base64(pixels), error: gl.getError(), name: renderer.name };
   },
 
-  /** Draw the rays of a picture; return how much that looks up, and its colours as float32 RGBA in base64. */
+  /** Draw the rays of a picture; return how many texels and cells they look up, and the colours if none is resampled. */
   async counted(job: Job) {
-    const { renderer, moments, appearance } = await prepared(job);
-    const options = { level: job.level, part: job.part, appearance, isCounted: true };
-    const rasters = await renderer.read(job.camera, moments, options);
-    const sum = (channel: number) =>
-      rasters.reduce((all, { sums }) => all + sums.reduce((s, x, i) => (i % 4 === channel ? s + x : s), 0), 0);
-    const [{ width, height }] = rasters;
-    return { width, height, samples: sum(1), cells: sum(2), rays: width * height * rasters.length };
+    const renderer = await drawn({ ...job, level: { level: 'fastest', scale: 0.1 } });
+    const { moments, options } = await prepared(job);
+    const rasters = await renderer.read(job.camera, moments(), { ...options, isCounted: true });
+    const [{ width, height, rgba, sums }] = rasters;
+    const sum = (channel: number) => sums.reduce((all, x, i) => (i % 4 === channel ? all + x : all), 0);
+    const isWhole = width === job.camera.width && height === job.camera.height;
+    const pixels = isWhole ? base64(Uint8Array.from(rgba, (x) => Math.round(255 * Math.min(Math.max(x, 0), 1)))) : null;
+    const { perSample, folding } = moments()[0].scene.lookUps(job.level === 'reference');
+    return { width, height, samples: sum(1), cells: sum(2), perSample, folding, pixels };
   },
 
-  /** Draw pictures one after the other; return the milliseconds that each took. */
+  /** Return what `auto` chooses from. */
+  async rungs(job: Job): Promise<(Rung & { cost: number })[]> {
+    const texels = texelsPerPixel((await open(job)).clip.scenes[0], job.camera);
+    return rungsOf(texels).map((rung) => ({ ...rung, cost: costOf(rung, texels) }));
+  },
+
+  /** Return which of the rungs `auto` chooses on a device that takes so many seconds for each. */
+  async chosen(job: Job, seconds: number[], fps: number): Promise<number> {
+    const texels = texelsPerPixel((await open(job)).clip.scenes[0], job.camera);
+    const names = rungsOf(texels).map((rung) => JSON.stringify(rung));
+    const pace = new Pace(1 / fps, FIRST_RAYS);
+    for (let i = 0; i < CHOOSING_FRAMES; i++) {
+      const rung = pace.rung(texels);
+      pace.record(costOf(rung, texels), seconds[names.indexOf(JSON.stringify(rung))]);
+    }
+    return names.indexOf(JSON.stringify(pace.rung(texels)));
+  },
+
+  /** Play for some seconds as fast as it goes; return the milliseconds between pictures, and what was drawn last. */
+  async play(job: Job, seconds: number) {
+    const renderer = await drawn(job);
+    const clip = (await open(job)).clip;
+    const began = performance.now();
+    const shown: number[] = [];
+    let state: DrawnPicture | null = null;
+    while (performance.now() < began + 1000 * seconds) {
+      const time = ((performance.now() - began) / 1000 / clip.duration) % 1;
+      const { moments, options } = await prepared({ ...job, time });
+      const before: number = state?.pictures ?? 0;
+      do {
+        state = renderer.draw(job.camera, moments(), options);
+        await finished(renderer);
+      } while (state.pictures === before && !state.isSharp);
+      shown.push(performance.now());
+    }
+    return { ms: shown.slice(1).map((at, i) => at - shown[i]), level: state?.level, scale: state?.scale };
+  },
+
+  /** Draw pictures one after the other, all that they need being there; return the milliseconds that each took. */
   async frames(jobs: Job[]): Promise<number[]> {
     const took: number[] = [];
     for (const job of jobs) {
-      const { renderer, moments, appearance } = await prepared(job);
+      const { renderer, moments, options } = await prepared(job);
       const started = performance.now();
-      renderer.draw(job.camera, moments, { level: job.level, part: job.part, appearance });
-      await finished(renderer.gl);
+      let state = renderer.draw(job.camera, moments(), options);
+      for (const before = state.pictures; state.pictures === before && !state.isSharp; ) {
+        await finished(renderer);
+        state = renderer.draw(job.camera, moments(), options);
+      }
+      await finished(renderer);
       took.push(performance.now() - started);
-      while (renderer.isBusy) await pause(0);
     }
     return took;
   },
 
+  /** Take the context away and give it back; return the picture of a job before, and the one after. */
+  async lost(job: Job) {
+    const before = await page.picture(job);
+    const { gl } = (await open(job)).renderer;
+    const extension = gl.getExtension('WEBGL_lose_context') as WEBGL_lose_context;
+    extension.loseContext();
+    while (!gl.isContextLost()) await pause(1);
+    await pause(10);
+    extension.restoreContext();
+    while (gl.isContextLost()) await pause(1);
+    return [before, await page.picture(job)];
+  },
+
   /** Return the text of shader files for the first scene of a file, with macros besides the scene's. */
   async shaders(job: Job, names: string[], defines: Defines): Promise<Composed[]> {
-    const scene = sourceOf((await open(job)).groups.first);
+    const [scene] = (await open(job)).clip.scenes;
     const layout = new Layout(scene);
     const written = {
       decoder_weights: constants(decoderArrays(scene.decoder, scene, layout)),
@@ -146,10 +207,13 @@ const page = {
 
   /** Close everything; return the objects that are left on cards. */
   close(): number {
-    const renderers = [...opened.values()].map(({ renderer }) => renderer);
+    const all = [...opened.values()];
     opened.clear();
-    for (const renderer of renderers) renderer.dispose();
-    return renderers.reduce((sum, renderer) => sum + renderer.objects, 0);
+    for (const { clip, renderer } of all) {
+      clip.close();
+      renderer.dispose();
+    }
+    return all.reduce((sum, { renderer }) => sum + renderer.objects, 0);
   },
 };
 

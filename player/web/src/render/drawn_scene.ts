@@ -31,15 +31,14 @@ interface Parts {
 export class DrawnScene {
   readonly source: SceneSource;
   #parts: Parts | null = null;
-  #uploads = 0;
 
   constructor(source: SceneSource) {
     this.source = source;
   }
 
   /** Changes whenever the picture may have changed. */
-  get version(): string {
-    return `${this.source.version} ${this.#uploads}`;
+  get version(): number {
+    return this.source.version;
   }
 
   /** Upload rows of planes that have arrived, as many as a frame has time for. */
@@ -48,7 +47,6 @@ export class DrawnScene {
     for (const rows of this.source.take(BYTES_A_FRAME)) {
       textures.put(rows);
       folded?.planesChanged();
-      this.#uploads++;
     }
   }
 
@@ -103,13 +101,13 @@ export class DrawnScene {
     device.draw(program, target.handle, [0, 0, width, height], { scissor: [0, firstRow, width, rowCount] });
   }
 
-  /** Texels that a sample looks up in planes and rows, and that folding looks up and writes for another time. */
-  get lookUps(): { perSample: (quality: Quality) => number; folding: number } {
+  /** Return the texels of planes and rows that a sample looks up, and those that folding writes for another time. */
+  lookUps(isExact: boolean): { perSample: number; folding: number } {
     const features = this.#parts?.textures.layout.features ?? 0;
-    const isDynamic = this.source.head.isDynamic;
+    const isFolded = this.source.head.isDynamic && !isExact;
     return {
-      perSample: (quality) => features * (quality.folded || !isDynamic ? 3 : 6),
-      folding: this.#parts?.folded?.foldedTexels ?? 0,
+      perSample: features * (isExact && this.source.head.isDynamic ? 6 : 3),
+      folding: isFolded ? (this.#parts?.folded?.foldedTexels ?? 0) : 0,
     };
   }
 

@@ -15,20 +15,24 @@ const SIDES = Array.from({ length: 15 }, (_, i) => 2 ** ((i - 14) / 4));
  * the second number is where they cost more. Figures: docs/benchmarks.md, "Drawing in a browser".
  */
 const COARSE_TEXELS = [1.7, 2];
+/** A raster whose pixels span more than so many texels shows too little; but slow devices may always go to this side. */
+const MOST_TEXELS = 3.5;
+const LEAST_SIDE = 0.35;
 
 /** Return the rungs for pictures whose pixels span so many texels of the finest scale, from the fastest on. */
 export function rungsOf(texelsPerPixel: number): Rung[] {
   const [least, most] = COARSE_TEXELS;
-  const rungs = (level: Level, sides: number[]) =>
-    sides.map((side) => ({ level, scale: side / LEVELS[level].resolution }));
+  const sides = SIDES.filter((side) => texelsPerPixel <= MOST_TEXELS * side || side >= LEAST_SIDE);
+  const rungs = (level: Level, chosen: number[]) =>
+    chosen.map((side) => ({ level, scale: side / LEVELS[level].resolution }));
   return [
     ...rungs(
       'fastest',
-      SIDES.filter((side) => texelsPerPixel >= least * side),
+      sides.filter((side) => texelsPerPixel >= least * side),
     ),
     ...rungs(
       'faster',
-      SIDES.filter((side) => side < 1 && texelsPerPixel <= most * side),
+      sides.filter((side) => side < 1 && texelsPerPixel <= most * side),
     ),
     ...rungs('balanced', [1]),
     ...rungs('fine', [1]),
@@ -38,11 +42,17 @@ export function rungsOf(texelsPerPixel: number): Rung[] {
 // Share of the time of a frame that drawing may take, and above which it is too slow.
 const IN_TIME = 0.8;
 const TOO_SLOW = 1.05;
-// Frames on a rung before a coarser or a finer one: slow frames disturb at once, a finer picture can wait.
-const DOWN_AFTER = 2;
+// Frames of one cost before a coarser or a finer one: slow frames disturb at once, a finer picture can wait.
+const DOWN_AFTER = 3;
 const UP_AFTER = 8;
-// Frames for which the cost of what proved too slow is remembered.
+// Frames for which the time of other costs, and what proved too slow, is remembered.
 const REMEMBERED = 300;
+// Share of the time of a frame below which the next finer rung is tried, whatever is expected of it, and its cost over
+// that of the one before.
+const ROOMY = 0.7;
+const NEXT_COST = 1.5;
+// Weight of the fictitious frame without rays that takes no time, so that one known time suffices.
+const ORIGIN_WEIGHT = 0.5;
 
 /** Return the rays that are marched for each pixel that spans so many texels, those of longer steps counting less. */
 export function costOf({ level, scale }: Rung, texelsPerPixel: number): number {
@@ -51,14 +61,19 @@ export function costOf({ level, scale }: Rung, texelsPerPixel: number): number {
   return (rays * resolution * scale) ** 2 / step;
 }
 
-/** Chooses a rung by how long frames took. */
+/**
+ * Chooses a rung by how long frames took: fixed + perRay cost seconds, fitted to the times of the costs that were tried,
+ * as kpc.player.app.resolution_controller does. If the time of one of them changes, those of all do, by the same factor.
+ */
 export class Pace {
   /** In which a frame is to be drawn. */
   secondsPerFrame: number;
   /** Rays for each pixel that there is time for, as far as is known. */
   #affordable: number;
   #recent: number[] = [];
+  #lastCost = 0;
   #frames = 0;
+  readonly #times = new Map<number, { seconds: number; frame: number }>();
   #tooMuch = { cost: Number.POSITIVE_INFINITY, until: 0 };
 
   /** @param affordable rays for each pixel of the first pictures. */
@@ -76,16 +91,22 @@ export class Pace {
   /** Take the time of a picture, and how many rays were marched for each of its pixels. */
   record(cost: number, seconds: number): void {
     this.#frames++;
-    this.#recent.push(seconds / cost);
-    const typical = median(this.#recent.slice(-DOWN_AFTER));
-    const isTooSlow = typical * cost > TOO_SLOW * this.secondsPerFrame;
-    if (this.#recent.length >= DOWN_AFTER && isTooSlow) {
-      this.#tooMuch = { cost, until: this.#frames + REMEMBERED };
-      this.#settle((IN_TIME * this.secondsPerFrame) / typical);
-    } else if (this.#recent.length >= UP_AFTER) {
-      const affordable = (IN_TIME * this.secondsPerFrame) / median(this.#recent);
-      this.#settle(Math.max(affordable, cost));
-    }
+    if (cost !== this.#lastCost) this.#recent = [];
+    this.#lastCost = cost;
+    this.#recent.push(seconds);
+    const lately = median(this.#recent.slice(-DOWN_AFTER));
+    const isTooSlow = lately > TOO_SLOW * this.secondsPerFrame;
+    if (this.#recent.length < (isTooSlow ? DOWN_AFTER : UP_AFTER)) return;
+    this.#learn(cost, isTooSlow ? lately : median(this.#recent));
+    this.#recent = [];
+    const { fixed, perRay } = this.#fit();
+    // If most of the time does not depend on the rays, fewer of them do more harm than good.
+    const [spare, least] = [IN_TIME * this.secondsPerFrame - fixed, fixed / 2];
+    const affordable = Math.max(spare, least) / perRay;
+    if (least > spare) this.#tooMuch.until = 0;
+    else if (isTooSlow && affordable < cost) this.#tooMuch = { cost, until: this.#frames + REMEMBERED };
+    const isRoomy = lately < ROOMY * this.secondsPerFrame;
+    this.#affordable = isTooSlow ? affordable : Math.max(affordable, isRoomy ? NEXT_COST * cost : cost);
   }
 
   #isAffordable(cost: number): boolean {
@@ -93,9 +114,24 @@ export class Pace {
     return cost <= this.#affordable && !isTooMuch;
   }
 
-  #settle(affordable: number): void {
-    this.#affordable = affordable;
-    this.#recent = [];
+  #learn(cost: number, seconds: number): void {
+    const factor = seconds / (this.#times.get(cost)?.seconds ?? seconds);
+    for (const [other, time] of this.#times) {
+      time.seconds *= factor;
+      if (time.frame < this.#frames - REMEMBERED) this.#times.delete(other);
+    }
+    this.#times.set(cost, { seconds, frame: this.#frames });
+  }
+
+  #fit(): { fixed: number; perRay: number } {
+    const known = [...this.#times].map(([cost, { seconds }]) => [cost, seconds]);
+    const sum = (term: (cost: number, seconds: number) => number) => known.reduce((all, [x, y]) => all + term(x, y), 0);
+    const n = known.length + ORIGIN_WEIGHT;
+    const [x, y, xx, xy] = [sum((cost) => cost), sum((_, s) => s), sum((cost) => cost * cost), sum((c, s) => c * s)];
+    const slope = (n * xy - x * y) / (n * xx - x * x);
+    const fixed = (y - slope * x) / n;
+    if (known.length < 2 || fixed < 0) return { fixed: 0, perRay: xy / xx };
+    return { fixed, perRay: Math.max(slope, 1e-9) };
   }
 }
 

@@ -55,8 +55,10 @@ const STILL: Rung = { level: 'fine', scale: 1 };
 const MOST_SECONDS = 0.25;
 /** Seconds for a ray, until it is known: of a card, and of a processor in its place. */
 const ASSUMED_SECONDS = { card: 2e-7, processor: 1e-5 };
+/** Frames a second that `auto` holds, unless others are asked for. */
+const FPS = { card: 30, processor: 10 };
 /** Rays for a pixel of the first pictures on a card, before it is known how fast it is. */
-const FIRST_RAYS = 0.1;
+export const FIRST_RAYS = 0.1;
 /** How fast what is known of it follows what is measured. */
 const NEW_WEIGHT = 0.5;
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
@@ -95,7 +97,8 @@ export class Renderer {
     this.#device = new Device(this.gl, options);
     this.#presentation = new Presentation(this.#device);
     this.#timer = new Timer(this.gl, this.isSoftware);
-    this.pace = new Pace(1 / (options.fps ?? 30), this.isSoftware ? 0 : FIRST_RAYS);
+    const fps = options.fps ?? (this.isSoftware ? FPS.processor : FPS.card);
+    this.pace = new Pace(1 / fps, this.isSoftware ? 0 : FIRST_RAYS);
     this.#secondsPerRay = this.isSoftware ? ASSUMED_SECONDS.processor : ASSUMED_SECONDS.card;
     this.gl.canvas.addEventListener('webglcontextlost', this.#onLost);
     this.gl.canvas.addEventListener('webglcontextrestored', this.#onRestored);
@@ -157,9 +160,9 @@ export class Renderer {
     const isAuto = level === 'auto';
     const wanted = isAuto ? this.pace.rung(texelsPerPixel(moments[0].scene.source, camera)) : rungOf(level);
     if (this.isLost || this.#timer.isBusy) return this.#state(wanted, false);
-    for (const { scene } of moments) scene.upload(this.#device);
+    for (const scene of this.#scenes) scene.upload(this.#device);
     const view = viewOf(camera, moments, options);
-    const versions = moments.map(({ scene }) => scene.version).join();
+    const versions = moments.map(({ scene }) => scene.source.version).join();
     const isStill = this.#shown !== null && isSame(this.#shown.view, view);
     const isShown = isStill && this.#shown?.versions === versions;
     if (this.#job?.role === STILL_ROLE && !isSame(this.#job.view, view)) this.#job = null;
@@ -199,7 +202,7 @@ export class Renderer {
     const rung = level === 'auto' ? STILL : rungOf(level);
     const keeping = { role: 'read', isExact: true, isCounted: options.isCounted ?? false };
     await this.#untilIdle();
-    for (const { scene } of moments) scene.upload(this.#device);
+    for (const scene of this.#scenes) scene.upload(this.#device);
     const job = new PictureJob(viewOf(camera, moments, options), rung, this.#presentation, keeping);
     while (job.rowsLeft > 0) {
       this.#march(job, MOST_SECONDS, () => {});

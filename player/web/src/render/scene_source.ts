@@ -34,7 +34,7 @@ export interface SceneSource {
   readonly occupancy: Pick<OccupancyGrid, 'sizes' | 'occupied'>;
   readonly decoder: DecoderWeights;
   readonly appearances: readonly Appearance[];
-  /** Grows whenever rows have arrived. */
+  /** Grows whenever the picture may have changed: rows have arrived or have been taken. */
   readonly version: number;
   /** Hand out rows of space planes that have arrived, about so many bytes of them, each once. */
   take(bytes: number): Iterable<PlaneRows>;

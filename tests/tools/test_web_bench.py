@@ -1,0 +1,33 @@
+"""Counting what pictures in a browser look up."""
+
+from pathlib import Path
+
+import pytest
+
+import kpc
+from kpc.format.scene.rig import Rig
+from kpc.player.cpu.reference import render
+from kpc.player.quality import LEVELS
+from kpc.player.viewpoints import fit_camera
+from kpc.tools.bench import web_bench, web_page
+from partial_scenes import coded
+from scenes import tiny_scene
+
+
+def test_look_ups_are_those_of_the_samples(tmp_path: Path) -> None:
+    reason = web_page.missing()
+    if reason is not None:
+        pytest.skip(reason)
+    data, size = coded(tiny_scene(4)), (48, 36)
+    (tmp_path / "scene.kpc").write_bytes(data)
+    name, found = web_bench.measure(web_bench.Drawing(tmp_path / "scene.kpc", size, is_timed=False))
+    assert "SwiftShader" in name and {(level, 1.0) for level in LEVELS} <= set(found)
+    scene = kpc.load(data)
+    samples = render(scene, fit_camera(Rig.of(scene).cameras[0], *size), web_bench.COMPARED_TIME).samples
+    exact, folded = found["reference", 1.0], found["finer", 1.0]
+    assert exact["samples_per_ray"] == pytest.approx(samples.mean(), rel=0.01)
+    # Two scales of eight channels are four layers; a sample looks up three planes of each, and as many rows.
+    assert exact["texels_per_pixel"] == pytest.approx(24 * samples.mean(), rel=0.01)
+    assert folded["texels_per_pixel"] < exact["texels_per_pixel"] and folded["psnr"] > 45
+    assert exact["cells_per_ray"] >= exact["samples_per_ray"]
+    assert {device for record in found.values() for device in record["chosen_on"]} == set(web_bench.DEVICES)
