@@ -134,7 +134,7 @@ export class KpcPlayer extends Base implements Model {
 
   attributeChangedCallback(name: string, before: string | null, value: string | null): void {
     if (before === value) return;
-    if (name === 'src' && this.isConnected) this.load();
+    if (name === 'src' && connected.has(this)) this.load();
     if (name === 'poster') this.#ui.setPoster(this.poster);
     if (name === 'loop') this.#clock.loop = this.loop;
     if (name === 'camera' && value !== null) this.camera = value;
@@ -498,7 +498,8 @@ export class KpcPlayer extends Base implements Model {
     );
     session.fetches = this.preload !== 'metadata' || mayPlay || !this.#clock.paused;
     this.#session = session;
-    this.#emit('loadstart');
+    // Listeners that are added after the element are told, too.
+    queueMicrotask(() => this.#session === session && this.#emit('loadstart'));
     session.open();
   }
 

@@ -82,7 +82,8 @@ export function fillSettings(panel: HTMLElement, model: Model, commands: Command
   const buttons = make('div', { class: 'choices' });
   buttons.append(
     make('button', { type: 'button', class: 'choice', onclick: () => commands.savePicture() }, 'Save picture'),
-    make('button', { type: 'button', class: 'choice keyboard', onclick: () => commands.toggleHelp() }, 'Keys'),
+    make('button', { type: 'button', class: 'choice', onclick: () => commands.copyLink() }, 'Copy link'),
+    make('button', { type: 'button', class: 'choice wide keyboard', onclick: () => commands.toggleHelp() }, 'Keys'),
   );
   panel.replaceChildren(...rows, buttons);
 }

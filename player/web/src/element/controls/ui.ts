@@ -80,7 +80,9 @@ export class Ui {
       new Popup('settings', 'Settings', (panel) => this.#opening(panel, () => fillSettings(panel, model, commands))),
     ];
     const [views, settings] = this.#popups;
-    const link = new IconButton('link', 'Copy link here and now', () => commands.copyLink());
+    const link = new IconButton('link', 'Copy link here and now', () => commands.copyLink(), {
+      class: 'button secondary',
+    });
     const buttons = [views.button, settings.button, link, this.#fill].map(({ element }) => element);
     this.#bar = make(
       'div',
@@ -212,6 +214,7 @@ export class Ui {
   }
 
   #opening(panel: HTMLElement, fill: () => void): void {
+    this.endHint();
     this.#keys.hidden = true;
     for (const popup of this.#popups) if (popup.panel !== panel) popup.close();
     fill();

@@ -1,0 +1,627 @@
+/**
+ * Watches <kpc-player> in headless Chromium: `node element_browser.mjs ADDRESS CHROMIUM FOLDER [NAME ...]`.
+ *
+ * The server at ADDRESS has the files and faults of tests/player/test_web_player.py, and page.html is what its query says.
+ * Writes a JSON object on one line: for each scenario {error, value}. Pictures of pages go to FOLDER.
+ */
+
+import assert from 'node:assert/strict';
+import { join } from 'node:path';
+import { chromium } from 'playwright-core';
+
+const FLAGS = [
+  ...['--headless', '--no-sandbox', '--no-first-run', '--disable-sync'],
+  ...['--disable-background-networking', '--disable-component-update'],
+  ...['--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'],
+];
+const EVENTS = [
+  ...['loadstart', 'loadedmetadata', 'progress', 'canplay', 'play', 'playing', 'pause', 'waiting', 'timeupdate'],
+  ...['seeking', 'seeked', 'ended', 'error', 'camera-change', 'ratechange', 'volumechange'],
+];
+const [address, executablePath, folder, ...chosen] = process.argv.slice(2);
+const scenarios = new Map();
+const scenario = (name, run) => scenarios.set(name, run);
+const browser = await chromium.launch({ executablePath, args: FLAGS });
+
+/**
+ * Open a page with players, at little cost.
+ * @param body HTML, in which `kpc-player` gets a size and a level unless `isPlain`.
+ */
+async function open(body, { hash = '', context = {}, isPlain = false, csp = '', before = () => {} } = {}) {
+  const viewport = { width: 480, height: 400 };
+  const browserContext = await browser.newContext({ viewport, ...context });
+  await browserContext.grantPermissions(['clipboard-read', 'clipboard-write']);
+  const page = await browserContext.newPage();
+  page.errors = [];
+  page.on('pageerror', (error) => page.errors.push(error.message));
+  const style = isPlain ? '' : '<style>kpc-player { width: 240px; height: 180px }</style>';
+  const policy = csp && `<meta http-equiv="Content-Security-Policy" content="${csp}">`;
+  const html = `<!doctype html><html lang="en"><meta charset="utf-8"><title>Test</title>${policy}
+    <meta name="viewport" content="width=device-width">${style}
+    <script type="module" src="kpc-player.js"></script><body>${body}</body></html>`;
+  await page.addInitScript((names) => {
+    globalThis.events = [];
+    for (const name of names) document.addEventListener(name, () => globalThis.events.push(name), true);
+  }, EVENTS);
+  await before(page);
+  await page.goto(`${address}/page.html?${encodeURIComponent(html)}${hash}`);
+  return page;
+}
+
+/** Return what a function of the page's first player returns. */
+const player = (page, run, ...args) =>
+  page.evaluate(`(${run})(document.querySelector('kpc-player'), ...${JSON.stringify(args)})`);
+/** Wait until a function of the page's first player returns true. */
+async function until(page, run, ...args) {
+  const due = performance.now() + 40_000;
+  while (!(await player(page, run, ...args))) {
+    assert.ok(
+      performance.now() < due,
+      `${run} is still false; ${await player(page, (it) => JSON.stringify(it.error))}`,
+    );
+    await page.waitForTimeout(50);
+  }
+}
+const shown = (page) => until(page, (it) => it.readyState >= 2);
+const inside = (page, selector) => page.locator('kpc-player').first().locator(selector);
+const button = (page, label) => inside(page, `.bar button[aria-label="${label}"]`);
+const events = (page) => page.evaluate(() => globalThis.events);
+const numbers = (text) => text.split(' ').map(Number);
+
+async function close(page) {
+  assert.deepEqual(page.errors, []);
+  await page.context().close();
+}
+
+const TAG = '<kpc-player src="scene.kpc" quality="fastest" controls muted></kpc-player>';
+const WIDE = TAG.replace('src', 'style="width: 400px" src');
+
+scenario('plays as a video does', async () => {
+  const page = await open(TAG.replace('muted', 'muted autoplay loop'));
+  await until(page, (it) => it.readyState === 4 && it.currentTime > 0.1);
+  const names = (await events(page)).filter((name) => name !== 'timeupdate' && name !== 'progress');
+  assert.deepEqual(names.slice(0, 5), ['loadstart', 'loadedmetadata', 'play', 'canplay', 'playing']);
+  assert.ok((await events(page)).includes('progress'));
+  await player(page, (it) => {
+    it.playbackRate = 4;
+    globalThis.times = [];
+    it.addEventListener('timeupdate', () => globalThis.times.push(it.currentTime));
+  });
+  await page.waitForFunction(() => globalThis.times.some((time, i) => time < globalThis.times[i - 1]), null, {
+    timeout: 40_000,
+  });
+  const state = await player(page, (it) => ({
+    ...{ paused: it.paused, ended: it.ended, duration: it.duration, rate: it.playbackRate, error: it.error },
+    buffered: [it.buffered.length, it.buffered.start(0), it.buffered.end(0)],
+  }));
+  assert.deepEqual(state, {
+    ...{ paused: false, ended: false, duration: 29 / 12, rate: 4, error: null },
+    buffered: [1, 0, 29 / 12],
+  });
+  await player(page, (it) => {
+    it.loop = false;
+  });
+  await until(page, (it) => it.ended && it.paused);
+  assert.deepEqual((await events(page)).slice(-3), ['timeupdate', 'pause', 'ended']);
+  assert.equal(await player(page, (it) => it.currentTime), 29 / 12);
+  const replayed = await player(page, async (it) => {
+    await it.play();
+    const time = it.currentTime;
+    const rejected = it.play().then(
+      () => 'resolved',
+      (error) => error.name,
+    );
+    it.pause();
+    return [time < 1, await rejected];
+  });
+  assert.deepEqual(replayed, [true, 'resolved']);
+  await close(page);
+});
+
+scenario('draws what the reference draws', async () => {
+  const page = await open(TAG.replace('fastest', 'reference').replace('src', 'style="width: 96px; height: 72px" src'));
+  await shown(page);
+  const value = await player(page, async (it) => {
+    it.currentTime = 1.3;
+    await new Promise((resolve) => it.addEventListener('seeked', resolve, { once: true }));
+    const bytes = new Uint8Array(await (await it.toBlob()).arrayBuffer());
+    return { camera: it.camera, picture: btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join('')) };
+  });
+  await close(page);
+  return value;
+});
+
+scenario('knows the viewpoints of the desktop player', async () => {
+  const page = await open(TAG);
+  await shown(page);
+  const value = await player(page, (it) => {
+    const views = {};
+    for (const name of ['opening', ...it.presets, ...it.cameras]) {
+      it.camera = name;
+      views[name] = it.camera;
+    }
+    return views;
+  });
+  await close(page);
+  return value;
+});
+
+scenario('reflects attributes and properties', async () => {
+  const page = await open('<kpc-player></kpc-player>');
+  const got = await player(page, (it) => {
+    Object.assign(it, { controls: true, loop: true, autoplay: true, playsInline: true, poster: 'a.jpg' });
+    Object.assign(it, { preload: 'none', quality: 'fine', targetFps: 50, part: 'static', memory: 1e8, volume: 0.5 });
+    it.muted = true;
+    const html = it.outerHTML;
+    it.setAttribute('quality', 'odd');
+    it.setAttribute('target-fps', '-3');
+    it.setAttribute('preload', 'NONE');
+    const late = document.createElement('kpc-player');
+    return {
+      html,
+      now: [it.quality, it.targetFps, it.preload, it.muted, it.volume, it.shownPart, it.cameraControls],
+      fresh: [
+        late.duration,
+        late.readyState,
+        late.buffered.length,
+        late.paused,
+        late.currentTime,
+        late.error,
+        late.src,
+      ],
+    };
+  });
+  assert.match(got.html, /controls="" loop="" autoplay="" playsinline="" poster="a.jpg" preload="none" quality="fine"/);
+  assert.match(got.html, /target-fps="50" part="static" memory="100000000"/);
+  assert.deepEqual(got.now, ['auto', 30, 'none', true, 0.5, 'static', true]);
+  assert.deepEqual(got.fresh, [Number.NaN, 0, 0, true, 0, null, '']);
+  assert.deepEqual(await events(page), ['volumechange', 'volumechange']);
+  await close(page);
+});
+
+scenario('seeks in a long clip, where nothing has arrived', async () => {
+  const page = await open(TAG.replace('scene.kpc', 'slow/long.kpc'));
+  await shown(page);
+  const gap = await player(page, (it) => it.buffered.end(it.buffered.length - 1) < 0.8 * it.duration);
+  await player(page, (it) => {
+    it.currentTime = 0.9 * it.duration;
+  });
+  await until(page, (it) => !it.seeking);
+  const names = await events(page);
+  assert.ok(names.indexOf('seeked') > names.indexOf('seeking'));
+  assert.ok(gap && (await player(page, (it) => it.readyState >= 2 && it.buffered.length > 0)));
+  await close(page);
+});
+
+scenario('is turned by the mouse, and goes on for a moment', async () => {
+  const page = await open(`${TAG}<div style="height: 2000px"></div>`);
+  await shown(page);
+  const opening = await player(page, (it) => it.camera);
+  await page.mouse.move(40, 50);
+  await page.mouse.wheel(0, 300);
+  assert.equal(await player(page, (it) => it.camera), opening); // the wheel is the page's
+  await until(page, () => scrollY > 0);
+  await page.evaluate(() => window.scrollTo({ top: 0, behavior: 'instant' }));
+  await page.mouse.down();
+  for (let x = 40; x <= 64; x += 4) await page.mouse.move(x, 50);
+  const dragged = await player(page, (it) => it.camera);
+  await page.mouse.up();
+  assert.notEqual(dragged, opening);
+  await until(page, (it, before) => it.camera !== before, dragged);
+  await page.waitForTimeout(600);
+  const rested = numbers(await player(page, (it) => it.camera));
+  await page.mouse.wheel(0, -100);
+  await until(page, (it, before) => it.camera !== before, rested.join(' '));
+  const zoomed = numbers(await player(page, (it) => it.camera));
+  const distance = (view) => Math.hypot(...[0, 1, 2].map((i) => view[i] - view[i + 3]));
+  assert.ok(Math.abs(distance(zoomed) / distance(rested) - 0.9) < 0.01);
+  assert.ok((await events(page)).includes('camera-change'));
+  await page.mouse.move(60, 50);
+  await page.mouse.down({ button: 'right' });
+  await page.mouse.move(61, 50, { steps: 2 });
+  await page.mouse.up({ button: 'right' });
+  const panned = numbers(await player(page, (it) => it.camera));
+  assert.notDeepEqual(panned.slice(3, 6), zoomed.slice(3, 6));
+  await close(page);
+});
+
+scenario('comes back to where the scene holds', async () => {
+  const page = await open(TAG);
+  await shown(page);
+  await player(page, (it) => {
+    it.camera = 'middle';
+  });
+  await inside(page, '.stage').focus();
+  await page.keyboard.down('d');
+  await page.waitForTimeout(700);
+  await page.keyboard.up('d');
+  const away = numbers(await player(page, (it) => it.camera));
+  await page.waitForTimeout(1500);
+  const back = numbers(await player(page, (it) => it.camera));
+  const focus = [0.02, 0.1, 0.56];
+  const from = (view) => Math.hypot(...focus.map((x, i) => view[i + 3] - x));
+  assert.ok(from(back) < 0.2903 && from(away) > from(back), `${away} ${back}`);
+  await close(page);
+});
+
+scenario('heeds the keys of the desktop player', async () => {
+  const page = await open(TAG);
+  await shown(page);
+  await inside(page, '.stage').focus();
+  const press = async (...keys) => {
+    for (const key of keys) await page.keyboard.press(key);
+  };
+  await press('ArrowRight', 'ArrowRight');
+  assert.ok(Math.abs((await player(page, (it) => it.currentTime)) - 2 / 12) < 1e-6);
+  await press('End');
+  assert.equal(await player(page, (it) => it.currentTime), 29 / 12);
+  await press('Home', ']', 'l', 'c', '-');
+  const state = await player(page, (it) => [it.currentTime, it.playbackRate, it.loop, it.shownPart, it.quality]);
+  assert.deepEqual(state, [0, 2, true, 'static', 'fastest']);
+  await press(' ');
+  await until(page, (it) => !it.paused);
+  await press(' ', 'n');
+  await until(page, (it) => it.paused);
+  const cameras = await player(page, (it) => {
+    const now = it.camera;
+    it.camera = it.cameras[1];
+    return [now, it.camera];
+  });
+  assert.equal(cameras[0], cameras[1]);
+  await press('h');
+  assert.equal(await inside(page, '.panel.keys').isVisible(), true);
+  await press('Escape');
+  assert.equal(await inside(page, '.panel.keys').isVisible(), false);
+  await close(page);
+});
+
+scenario('is turned by one finger, moved and pinched by two', async () => {
+  const page = await open(TAG, { context: { hasTouch: true, isMobile: true } });
+  await shown(page);
+  const client = await page.context().newCDPSession(page);
+  const touch = async (type, ...points) =>
+    client.send('Input.dispatchTouchEvent', { type, touchPoints: points.map(([x, y], id) => ({ x, y, id })) });
+  const before = numbers(await player(page, (it) => it.camera));
+  const box = await inside(page, '.stage').boundingBox();
+  const at = (x, y) => [box.x + x, box.y + y];
+  await touch('touchStart', at(30, 40));
+  for (let x = 34; x <= 60; x += 4) await touch('touchMove', at(x, 40));
+  await touch('touchEnd');
+  await page.waitForTimeout(800);
+  const turned = numbers(await player(page, (it) => it.camera));
+  assert.ok(Math.hypot(...[0, 1, 2].map((i) => turned[i] - before[i])) > 0.1);
+  await touch('touchStart', at(50, 40), at(70, 40));
+  for (let by = 1; by <= 10; by++) await touch('touchMove', at(50 - by, 40), at(70 + by, 40));
+  await touch('touchEnd');
+  const pinched = numbers(await player(page, (it) => it.camera));
+  const distance = (view) => Math.hypot(...[0, 1, 2].map((i) => view[i] - view[i + 3]));
+  assert.ok(distance(pinched) < 0.7 * distance(turned));
+  await close(page);
+});
+
+scenario('copies a link to a view at a time, which restores both', async () => {
+  const page = await open(WIDE);
+  await shown(page);
+  await player(page, (it) => {
+    it.currentTime = 1.25;
+    it.camera = 'left';
+  });
+  const camera = await player(page, (it) => it.camera);
+  await button(page, 'Copy link here and now').click();
+  await page.waitForFunction(() => navigator.clipboard.readText().then((text) => text.includes('#')));
+  const link = await page.evaluate(() => navigator.clipboard.readText());
+  assert.equal(new URL(link).hash, `#t=1.25&camera=${camera.replaceAll(' ', ',')}`);
+  const other = await open(TAG, { hash: new URL(link).hash });
+  await shown(other);
+  assert.deepEqual(await player(other, (it) => [it.currentTime, it.camera]), [1.25, camera]);
+  await other.evaluate(() => {
+    location.hash = '#t=0.5';
+  });
+  await until(other, (it) => it.currentTime === 0.5);
+  await close(page);
+  await close(other);
+});
+
+scenario('works twice on a page, in a shadow root, and put back', async () => {
+  const page = await open(`<div id="host"></div>${TAG.replace('src', 'id="b" src')}`, { hash: '#t=1&player=b' });
+  await page.evaluate((tag) => {
+    const root = document.querySelector('#host').attachShadow({ mode: 'open' });
+    root.innerHTML = `<style>kpc-player { width: 96px; height: 96px }</style>${tag}`;
+  }, TAG);
+  await page.waitForFunction(
+    () => document.querySelector('#host').shadowRoot.querySelector('kpc-player').readyState === 4,
+    null,
+    { timeout: 40_000 },
+  );
+  await shown(page);
+  const other = await page.evaluate(
+    () => document.querySelector('#host').shadowRoot.querySelector('kpc-player').currentTime,
+  );
+  assert.deepEqual([other, await player(page, (it) => it.currentTime)], [0, 1]);
+  const put = await player(page, async (it) => {
+    it.camera = 'left';
+    const { camera } = it;
+    const canvas = it.shadowRoot.querySelector('canvas');
+    document.body.prepend(it); // moved at once: goes on
+    const isSame = it.shadowRoot.querySelector('canvas') === canvas;
+    it.remove();
+    await new Promise((resolve) => setTimeout(resolve, 50));
+    const gone = [it.shadowRoot.querySelector('canvas'), it.readyState];
+    document.body.append(it);
+    await new Promise((resolve) => it.addEventListener('canplay', resolve, { once: true }));
+    return { isSame, gone, isKept: it.camera === camera && it.currentTime === 1 };
+  });
+  assert.deepEqual(put, { isSame: true, gone: [null, 0], isKept: true });
+  await close(page);
+});
+
+scenario('leaves nothing behind over 50 mounts', async () => {
+  const page = await open('', {
+    before: (it) =>
+      it.addInitScript(() => {
+        globalThis.counts = { workers: 0, listeners: 0, contexts: [] };
+        const { counts } = globalThis;
+        globalThis.Worker = class extends Worker {
+          constructor(...args) {
+            super(...args);
+            counts.workers++;
+          }
+          terminate() {
+            counts.workers--;
+            super.terminate();
+          }
+        };
+        const { getContext } = HTMLCanvasElement.prototype;
+        HTMLCanvasElement.prototype.getContext = function (...args) {
+          const context = getContext.apply(this, args);
+          counts.contexts.push(context);
+          return context;
+        };
+        for (const target of [window, document]) {
+          const { addEventListener, removeEventListener } = target;
+          target.addEventListener = function (...args) {
+            counts.listeners++;
+            addEventListener.apply(this, args);
+          };
+          target.removeEventListener = function (...args) {
+            counts.listeners--;
+            removeEventListener.apply(this, args);
+          };
+        }
+      }),
+  });
+  const value = await page.evaluate(async (tag) => {
+    const { counts } = globalThis;
+    const [listeners, workers] = [counts.listeners, counts.workers];
+    for (let mount = 0; mount < 50; mount++) {
+      document.body.innerHTML = tag;
+      const player = document.querySelector('kpc-player');
+      // Most are removed before they draw, some before they have opened the file.
+      const event = mount % 10 === 9 ? 'canplay' : mount % 3 === 0 ? 'loadstart' : 'loadedmetadata';
+      await (event === 'loadstart'
+        ? new Promise((resolve) => setTimeout(resolve, 5))
+        : new Promise((resolve) => player.addEventListener(event, resolve, { once: true })));
+      player.remove();
+      await new Promise((resolve) => setTimeout(resolve, 0));
+    }
+    await new Promise((resolve) => setTimeout(resolve, 300));
+    const alive = counts.contexts.filter((context) => !context.isContextLost()).length;
+    return {
+      workers: counts.workers - workers,
+      listeners: counts.listeners - listeners,
+      alive,
+      made: counts.contexts.length,
+    };
+  }, TAG);
+  assert.ok(value.made >= 30);
+  assert.deepEqual([value.workers, value.listeners, value.alive], [0, 0, 0]);
+  await close(page);
+});
+
+const WRONG = {
+  'no-such.kpc': ['not-found', /no such file/],
+  'text.kpc': ['foreign', /not a \.kpc file/],
+  'draft.kpc': ['draft', /draft version/],
+  'half.kpc': ['damaged', /damaged/],
+  'refused/scene.kpc': ['blocked', /Access-Control-Allow-Origin: http:\/\/127/],
+};
+
+for (const [src, [code, words]] of Object.entries(WRONG)) {
+  scenario(`says what is wrong: ${code}`, async () => {
+    // The refusing server is another site.
+    const full = src.startsWith('refused') ? `${address.replace('127.0.0.1', 'localhost')}/${src}` : src;
+    const page = await open(TAG.replace('scene.kpc', full));
+    await until(page, (it) => it.error !== null);
+    const { error, isRejected } = await player(page, async (it) => {
+      const isRejected = await it.play().then(
+        () => false,
+        (thrown) => thrown.name === 'NotSupportedError',
+      );
+      return { error: it.error, isRejected };
+    });
+    assert.equal(error.code, code, error.detail);
+    assert.match(error.message, words);
+    assert.ok(isRejected);
+    assert.equal(await inside(page, '.error p').textContent(), error.message);
+    assert.ok((await events(page)).includes('error'));
+    await player(page, (it) => {
+      it.src = 'scene.kpc';
+    });
+    await shown(page);
+    assert.equal(await inside(page, '.error').isVisible(), false);
+    await close(page);
+  });
+}
+
+scenario('says that there is no WebGL2', async () => {
+  const page = await open(TAG, {
+    before: (it) =>
+      it.addInitScript(() => {
+        HTMLCanvasElement.prototype.getContext = () => null;
+      }),
+  });
+  await until(page, (it) => it.error?.code === 'no-webgl');
+  assert.match(await inside(page, '.error p').textContent(), /WebGL2/);
+  await close(page);
+});
+
+for (const fault of ['slow', 'cut', 'whole', 'packed', 'moved']) {
+  scenario(`plays from a server that is ${fault}`, async () => {
+    const page = await open(TAG.replace('scene.kpc', `${fault}/long.kpc`));
+    await until(page, (it) => it.readyState >= 3);
+    await player(page, (it) => it.play());
+    await until(page, (it) => it.currentTime > 0.2);
+    assert.equal(await player(page, (it) => it.error), null);
+    await close(page);
+  });
+}
+
+scenario('notices that the file was replaced', async () => {
+  const page = await open(TAG.replace('scene.kpc', 'replaced/long.kpc'));
+  await until(page, (it) => it.error !== null);
+  assert.equal(await player(page, (it) => it.error.code), 'replaced');
+  await close(page);
+});
+
+scenario('draws again once a lost context is back', async () => {
+  const page = await open(TAG.replace('muted', 'muted autoplay loop'), {
+    before: (it) =>
+      it.addInitScript(() => {
+        const { getContext } = HTMLCanvasElement.prototype;
+        HTMLCanvasElement.prototype.getContext = function (...args) {
+          globalThis.gl = getContext.apply(this, args);
+          return globalThis.gl;
+        };
+      }),
+  });
+  await until(page, (it) => it.currentTime > 0.1);
+  await page.evaluate(() => {
+    globalThis.extension = globalThis.gl.getExtension('WEBGL_lose_context');
+    globalThis.extension.loseContext();
+  });
+  await until(page, (it) => it.shadowRoot.querySelector('.notice').textContent.includes('graphics card'));
+  await page.evaluate(() => globalThis.extension.restoreContext());
+  await until(page, (it) => it.shadowRoot.querySelector('.notice').textContent === '');
+  const range = await player(page, async (it) => {
+    it.pause();
+    const picture = await createImageBitmap(await it.toBlob());
+    const canvas = new OffscreenCanvas(picture.width, picture.height);
+    const context = canvas.getContext('2d');
+    context.drawImage(picture, 0, 0);
+    const { data } = context.getImageData(0, 0, picture.width, picture.height);
+    const reds = data.filter((_, i) => i % 4 === 0);
+    return Math.max(...reds) - Math.min(...reds);
+  });
+  assert.ok(range > 100);
+  await close(page);
+});
+
+scenario('shows the poster and loads nothing before it is asked to', async () => {
+  const page = await open(TAG.replace('muted', 'muted preload="none" poster="poster.png"'));
+  await page.waitForTimeout(200);
+  assert.deepEqual(await events(page), []);
+  assert.equal(await inside(page, '.poster').evaluate((it) => it.naturalWidth > 0), true);
+  await inside(page, '.large').click();
+  await until(page, (it) => it.currentTime > 0.1);
+  assert.equal(await inside(page, '.large').isVisible(), false);
+  assert.ok(await inside(page, '.poster').evaluate((it) => it.classList.contains('done')));
+  await close(page);
+});
+
+scenario('reads the header alone with preload="metadata"', async () => {
+  const page = await open(TAG.replace('muted', 'muted preload="metadata"').replace('scene', 'slow/long'));
+  await until(page, (it) => it.readyState === 1);
+  assert.ok((await player(page, (it) => it.duration)) > 7);
+  assert.equal(await inside(page, '.large').isVisible(), true);
+  await player(page, (it) => it.play());
+  await close(page);
+});
+
+scenario('does not start by itself where motion is to be reduced', async () => {
+  const page = await open(TAG.replace('muted', 'muted autoplay'), { context: { reducedMotion: 'reduce' } });
+  await shown(page);
+  assert.equal(await player(page, (it) => it.paused), true);
+  await close(page);
+});
+
+scenario('works under a strict Content-Security-Policy', async () => {
+  const page = await open(TAG, {
+    csp: "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self'; connect-src 'self'",
+    isPlain: true,
+    context: { viewport: { width: 200, height: 200 } },
+  });
+  await until(page, (it) => it.readyState === 4);
+  assert.equal(await inside(page, '.bar').evaluate((it) => getComputedStyle(it).position), 'absolute');
+  await close(page);
+});
+
+const SCREENS = {
+  desktop: { viewport: { width: 1280, height: 800 } },
+  portrait: { viewport: { width: 390, height: 844 }, hasTouch: true, isMobile: true },
+  landscape: { viewport: { width: 844, height: 390 }, hasTouch: true, isMobile: true },
+};
+const WHOLE =
+  '<style>html, body { margin: 0; height: 100% } kpc-player { display: block; height: 100%; aspect-ratio: auto }</style>';
+
+for (const [name, context] of Object.entries(SCREENS)) {
+  scenario(`fits the screen: ${name}`, async () => {
+    const direction = name === 'portrait' ? 'rtl' : 'ltr';
+    const page = await open(WHOLE + TAG.replace('quality="fastest"', `dir="${direction}"`), {
+      context,
+      isPlain: true,
+    });
+    await shown(page);
+    await button(page, 'Settings').click();
+    const { width, height } = context.viewport;
+    const boxes = await player(page, (it) => {
+      const targets = [...it.shadowRoot.querySelectorAll('button, label, .timeline input')];
+      const boxOf = (target) => ({
+        label: target.ariaLabel ?? target.textContent,
+        ...target.getBoundingClientRect().toJSON(),
+      });
+      return targets.filter((target) => target.checkVisibility()).map(boxOf);
+    });
+    assert.ok(boxes.length >= 10);
+    for (const box of boxes) {
+      assert.ok(box.width >= 44 && box.height >= 44, `${box.label} is small: ${box.width}x${box.height}`);
+      assert.ok(box.left >= -8 && box.right <= width + 8, `${box.label} is cut off`);
+    }
+    const [play] = boxes.filter(({ label }) => label === 'Play');
+    assert.ok(play.left < width / 2 && play.bottom <= height);
+    assert.equal(await player(page, () => document.documentElement.scrollWidth <= innerWidth), true);
+    await page.screenshot({ path: join(folder, `${name}.png`) });
+    await close(page);
+  });
+}
+
+scenario('can be used without a mouse', async () => {
+  const page = await open(WIDE);
+  await shown(page);
+  const labels = [];
+  for (let tab = 0; tab < 8; tab++) {
+    await page.keyboard.press('Tab');
+    labels.push(await player(page, (it) => it.shadowRoot.activeElement?.ariaLabel ?? 'none'));
+  }
+  assert.match(labels[0], /^A corner of a room\. Drag/);
+  const names = ['Play', 'Time', 'Play', 'Views', 'Settings', 'Copy link here and now', 'Fill the screen'];
+  assert.deepEqual(labels.slice(1), names);
+  await close(page);
+});
+
+const results = {};
+try {
+  for (const [name, run] of scenarios) {
+    if (chosen.length > 0 && !chosen.some((part) => name.includes(part))) continue;
+    const started = performance.now();
+    try {
+      results[name] = { error: null, value: await run() };
+    } catch (error) {
+      results[name] = { error: error.stack, value: null };
+      for (const context of browser.contexts()) await context.close();
+    }
+    console.error(`${((performance.now() - started) / 1000).toFixed(1)} s ${name}: ${results[name].error ?? 'passed'}`);
+  }
+} finally {
+  await browser.close();
+}
+console.log(JSON.stringify(results));
