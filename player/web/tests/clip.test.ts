@@ -196,6 +196,15 @@ test('a jump fetches what the picture needs before what lies in between', async 
   });
 });
 
+test('a clip that begins elsewhere fetches what is there', async () => {
+  await withServer(LONG, { allowed: 200_000 }, async (server) => {
+    await withClip(server.url, { position: { time: 70 }, timeoutMs: 10_000 }, async (clip) => {
+      await until(clip, () => clip.canShow(70));
+      assert.ok(!clip.canShow(20));
+    });
+  });
+});
+
 test('a long scene plays in little memory, and what was dropped comes again', async () => {
   const all = new Scene(LONG, core).head.valueCount;
   const pool = { memory: 2 << 20 };

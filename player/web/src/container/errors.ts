@@ -44,6 +44,12 @@ export class FormatError extends KpcError {
   }
 }
 
+/** Return any error as one of this package: what a page cannot allocate exceeds its memory. */
+export function asKpcError(error: unknown): KpcError {
+  if (error instanceof KpcError) return error;
+  return error instanceof RangeError ? new BudgetError(String(error)) : new KpcError(String(error), 'worker');
+}
+
 /** Reading a .kpc file would need more memory than the reader was given. */
 export class BudgetError extends FormatError {
   override name = 'BudgetError';

@@ -5,7 +5,7 @@
  * long the clip is.
  */
 
-import { BudgetError, FormatError, KpcError } from '../container/errors.js';
+import { asKpcError, BudgetError, FormatError, KpcError } from '../container/errors.js';
 import { checkGroup } from '../container/groups.js';
 import type { Metadata } from '../container/metadata.js';
 import type { Camera, SceneHead } from '../container/scene_chunks.js';
@@ -27,6 +27,8 @@ const RATE_OVER_S = 1;
 export interface ClipOptions extends Pick<HttpOptions, 'fetch' | 'timeoutMs' | 'firstPauseMs'> {
   /** Bytes that the clip may take, on the graphics card, too. */
   memory?: number;
+  /** Where to begin. */
+  position?: ClipPosition;
   /** Ends opening. */
   signal?: AbortSignal;
   /** Workers that other clips use, too, or what to start workers with. */
@@ -124,11 +126,13 @@ export class Clip extends EventTarget {
     let source: Source | null = null;
     try {
       source = await sourceOf(src, { ...options, limit: Math.floor(memory / 2) });
-      return await Clip.#open(source, pool, ownsPool, memory, signal);
+      const clip = await Clip.#open(source, pool, ownsPool, memory, signal);
+      clip.setPlayhead(options.position ?? { time: 0 });
+      return clip;
     } catch (error) {
       if (ownsPool) pool.close();
       source?.close();
-      throw error;
+      throw asKpcError(error);
     }
   }
 
@@ -368,11 +372,12 @@ export class Clip extends EventTarget {
       if (opening.control.signal.aborted || this.#isClosed) scene.close();
       else {
         this.#next = scene;
+        scene.setPlayhead(this.#headIn(group));
         this.dispatchEvent(new SceneEvent('open', scene));
       }
     } catch (error) {
       if (!opening.control.signal.aborted && !this.#isClosed) {
-        this.#error = error instanceof KpcError ? error : new KpcError(String(error), 'worker');
+        this.#error = asKpcError(error);
       }
     }
     this.#opening = null;

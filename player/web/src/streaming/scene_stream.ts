@@ -6,7 +6,7 @@
  */
 
 import type { Container } from '../container/container.js';
-import { BudgetError, KpcError } from '../container/errors.js';
+import { asKpcError, BudgetError, KpcError } from '../container/errors.js';
 import { axisOf } from '../container/scene.js';
 import { isTimePlane, PLANES, type PlaneHead, type PlaneName, type Scale } from '../container/scene_chunks.js';
 import type { DecoderPool } from '../decoder/pool.js';
@@ -135,15 +135,13 @@ export class SceneStream {
     }
   }
 
-  /** Open a scene: wait for its header, its index and all chunks but planes, which then begin to come. */
+  /** Open a scene: wait for its header, its index and all chunks but planes, which `setPlayhead` lets come. */
   static async open(source: Source, pool: DecoderPool, options: SceneStreamOptions): Promise<SceneStream> {
     const { signal } = options;
     const container = await openContainer(source, signal);
     const content = await readContent(source, container, pool, options.memory, signal);
     options.check?.(content, container);
-    const stream = new SceneStream(source, pool, container, content, options);
-    stream.#schedule();
-    return stream;
+    return new SceneStream(source, pool, container, content, options);
   }
 
   get head(): SceneContent['head'] {
@@ -473,7 +471,7 @@ export class SceneStream {
 
   #fail(error: unknown): void {
     if (this.#isClosed || this.error !== null) return;
-    this.error = error instanceof KpcError ? error : new KpcError(String(error), 'worker');
+    this.error = asKpcError(error);
     this.#changed();
   }
 }
