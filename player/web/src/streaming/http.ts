@@ -109,7 +109,10 @@ export class HttpSource implements Source {
 
   async #readRange(start: number, end: number, options: ReadOptions): Promise<Uint8Array> {
     let bytes = new Uint8Array(end - start);
-    let reached = 0;
+    const known = options.fresh ? bytes.subarray(0, 0) : this.#beginning.subarray(start, end);
+    bytes.set(known);
+    if (known.length) options.arrived?.(bytes.subarray(0, known.length));
+    let reached = known.length;
     let failures = 0;
     while (reached < bytes.length) {
       const before = reached;
