@@ -32,7 +32,9 @@ VERSION_STRUCT = struct.Struct("<8sHH")  # magic, version, header_length: their 
 
 ZSTD_LEVEL = 19
 # Frames of any window are read: what they take is bounded by the size of their content.
-ZSTD_OPTIONS = {zstd.DecompressionParameter.window_log_max: zstd.DecompressionParameter.window_log_max.bounds()[1]}
+ZSTD_OPTIONS: dict[int, int] = {
+    zstd.DecompressionParameter.window_log_max: zstd.DecompressionParameter.window_log_max.bounds()[1]
+}
 ZSTD_BLOCK = 1 << 17  # bytes of a block of a zstd frame, at most (RFC 8878)
 
 # Bytes of file for each chunk, at least, so that a small file cannot claim many chunks.
@@ -205,7 +207,7 @@ def _zstd_frames(raw: bytes) -> list[bytes]:
     ones only.
     """
     parameter = zstd.CompressionParameter
-    long_matches = {parameter.compression_level: ZSTD_LEVEL, parameter.min_match: 7}
+    long_matches: dict[int, int] = {parameter.compression_level: ZSTD_LEVEL, parameter.min_match: 7}
     return [zstd.compress(raw, level=ZSTD_LEVEL), zstd.compress(raw, options=long_matches)]
 
 
