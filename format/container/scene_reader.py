@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, partial
@@ -113,7 +113,7 @@ def read(
 def _read_planes(reader: "SceneReader") -> tuple[dict[str, QuantisedPlane], ...]:
     """Decode all segments that are there, in threads."""
     entries = [(number, entry) for number, entry in enumerate(reader.index) if entry.kind == "PLNE"]
-    segments = [number for number, _ in entries if reader.available(number)]
+    segments = largest_first(reader, [number for number, _ in entries if reader.available(number)])
     scales = _empty_planes(reader, segments)
     side_info: dict[tuple[int, str], dict[int, SegmentSideInfo | None]] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -131,6 +131,11 @@ def _read_planes(reader: "SceneReader") -> tuple[dict[str, QuantisedPlane], ...]
         starts = sorted(e.row_start for _, e in entries if (e.scale, ALL_PLANES[e.plane]) == (s, name))
         scales[s][name] = replace(scales[s][name], side_info=merge_side_info(infos), starts=tuple(starts))
     return scales
+
+
+def largest_first(reader: "SceneReader", numbers: Sequence[int]) -> list[int]:
+    """Return chunks in an order in which threads that share them end at about the same time."""
+    return sorted(numbers, key=lambda number: -reader.index[number].stored_length)
 
 
 def _empty_planes(reader: "SceneReader", segments: Iterable[int]) -> tuple[dict[str, QuantisedPlane], ...]:
