@@ -44,8 +44,6 @@ def encode_groups(options: Options) -> dict[str, Any]:
     setting = replace(setting, dataset_sha256=hash_dataset(setting.dataset))
     work, spans = options.work_dir, plan_groups(options, setting.dataset.clip)
     numbers = range(len(spans)) if options.only is None else [options.only]
-    if numbers[-1] >= len(spans):
-        raise UsageError(f"--only {numbers[-1]}: the clip has {len(spans)} groups, numbered from 0")
     first = group_path(work, numbers[0])
     if options.resume and first.with_suffix(".json").exists():
         setting = replace(setting, aabb=scene_io.SceneReader(first).head.aabb, is_final=True)
@@ -77,9 +75,16 @@ def encode_groups(options: Options) -> dict[str, Any]:
 
 
 def plan_groups(options: Options, clip: Clip) -> tuple[groups.Span, ...]:
-    """Split a clip into groups of at most `options.group_s`; log where one holds all of it."""
+    """Split a clip into groups of at most `options.group_s`; log where one holds all of it.
+
+    Raises:
+        UsageError: groups are too short, or there is none of the number `options.only`.
+    """
     group_s = float(options.group_s or 0)
     spans = split_into_spans(clip, group_s)
+    if options.only is not None and options.only >= len(spans):
+        count = f"{len(spans)} group{'s' * (len(spans) != 1)}"
+        raise UsageError(f"--only {options.only}: the clip has {count}, numbered from 0")
     if len(spans) == 1:
         log(f"--group {group_s:g}s: the clip lasts {clip.total_s:.3g} s, so it is a single group")
     return spans

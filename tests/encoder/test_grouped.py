@@ -288,6 +288,8 @@ def test_a_dry_run_counts_all_groups(videos, tmp_path, monkeypatch):
     assert kpenc.dry_run(options) == expected
     assert kpenc.dry_run(replace(options, test_views=6)) == replace(expected, test_s=6.0, test_pictures=18)
     assert kpenc.dry_run(replace(options, only=1)) == Estimate(10.0, 2.0, 4.0, 9 + 2 * OVERLAP, 6, 8)
+    with pytest.raises(UsageError, match="--only 3: the clip has 3 groups"):
+        kpenc.dry_run(replace(options, only=3))
 
 
 def test_a_group_that_is_longer_than_the_clip_is_logged(capsys):
