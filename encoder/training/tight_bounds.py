@@ -46,7 +46,7 @@ def trim_box(
     Raises:
         TrainingError: as `Trainer.run`.
     """
-    steps = min(MAX_STEPS, config.steps // 10)
+    steps = max(1, min(MAX_STEPS, config.steps // 10))
     if time_budget_s is None and steps < MIN_STEPS:
         return aabb, 0.0
     coarse = replace(
