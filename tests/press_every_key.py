@@ -414,7 +414,9 @@ def dropped_files(player: Player, scene_file: Path) -> None:
     player.window.drop([str(scene_file)])
     player.run()
     assert player.successor is not None and not player.state.should_close
-    player.actions.stay()
+    with replaced(player.actions.playlist, position=1):
+        player.actions.stay()
+        assert player.actions.playlist.position == 0  # that of what is shown
     press(player, glfw.KEY_PAGE_DOWN)
     assert "one file" in player.snapshot().notice and player.successor is None
     player.actions.playlist.files.append("text.kpc")

@@ -46,7 +46,7 @@ class Actions:
         self, state: PlayerState, scene_view: SceneView, filming: Filming, files: OutputFiles, playlist: Playlist
     ) -> None:
         self.state, self.scene_view, self.filming, self.files = state, scene_view, filming, files
-        self.playlist = playlist
+        self.playlist, self._shown_at = playlist, playlist.position
         self.successor: GroupPlayback | None = None
         self.successor_file = ""
         self.dialog = OpenDialog()
@@ -281,6 +281,7 @@ class Actions:
     def stay(self) -> None:
         """Go on with the scene that is shown, whatever was to follow."""
         self.state.should_close = False
+        self.playlist.position = self._shown_at
         if self.successor is not None:
             self.successor.close()
             self.successor = None
