@@ -185,16 +185,21 @@ def _set_sizes(scale: float) -> None:
         scale: of the text and of all around it, 1 for a screen of ordinary density.
     """
     style = imgui.get_style()
+
+    def scaled(x: float, y: float) -> tuple[float, float]:
+        # Whole units, else a scroll bar appears where a rounded size lacks a fraction of one.
+        return round(x * scale), round(y * scale)
+
     style.font_scale_main = scale
     style.window_rounding = style.frame_rounding = style.grab_rounding = 5.0 * scale
     style.scrollbar_rounding = style.popup_rounding = 5.0 * scale
     style.window_border_size = 0.0
-    style.grab_min_size, style.scrollbar_size = 12.0 * scale, 14.0 * scale
-    style.window_padding = (10 * scale, 8 * scale)
-    style.frame_padding = (4 * scale, 3 * scale)
-    style.item_spacing = (8 * scale, 5 * scale)
-    style.item_inner_spacing = (4 * scale, 4 * scale)
-    style.cell_padding = (8 * scale, 2 * scale)
+    style.grab_min_size, style.scrollbar_size = scaled(12, 14)
+    style.window_padding = scaled(10, 8)
+    style.frame_padding = scaled(4, 3)
+    style.item_spacing = scaled(8, 5)
+    style.item_inner_spacing = scaled(4, 4)
+    style.cell_padding = scaled(8, 2)
 
 
 def _set_colours() -> None:
