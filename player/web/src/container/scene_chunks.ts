@@ -126,7 +126,7 @@ export class Cursor {
   /** Return `count` f16 as float32. */
   halves(count: number) {
     const start = this.take(2 * count);
-    return Float32Array.from({ length: count }, (_, k) => half(this.view.getUint16(start + 2 * k, true)));
+    return Float32Array.from({ length: count }, (_, k) => fromHalf(this.view.getUint16(start + 2 * k, true)));
   }
 
   finish() {
@@ -135,7 +135,8 @@ export class Cursor {
   }
 }
 
-function half(bits: number) {
+/** Return the number of the bits of an IEEE 754 binary16. */
+export function fromHalf(bits: number) {
   const sign = bits & 0x8000 ? -1 : 1;
   const exponent = (bits >> 10) & 31;
   const fraction = bits & 1023;

@@ -1,6 +1,7 @@
 /** WebGL2: what it can do, and the objects made of it, which are counted so that nothing is left behind. */
 
 import { KpcError } from '../container/errors.js';
+import { fromHalf } from '../container/scene_chunks.js';
 import { compose, type Defines, firstError, type Written } from './shader.js';
 
 /** This browser or card cannot draw a scene; the message says why, for people. */
@@ -11,6 +12,8 @@ export class RenderError extends KpcError {
     super(message, code);
   }
 }
+
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 
 /** How numbers of a texture are kept. */
 export type Format = 'rgba32f' | 'rgba16f' | 'rgba8' | 'rg32f' | 'rg16f' | 'r8ui';
@@ -44,6 +47,12 @@ export class Device {
   readonly filtersFloat32: boolean;
   /** Whether float32 textures can be drawn to; otherwise float16. */
   readonly drawsFloat32: boolean;
+  /** What draws: the name of the card and its driver, as far as the browser tells it. */
+  readonly name: string;
+  /** Whether a processor stands in for a graphics card. */
+  readonly isSoftware: boolean;
+  /** How planes are kept: cards look up float16 at twice the rate of float32, SwiftShader at two thirds. */
+  readonly planeFormat: 'rgba16f' | 'rgba32f';
   #objects = 0;
   readonly #vertices: WebGLVertexArrayObject;
 
@@ -57,6 +66,10 @@ export class Device {
     }
     this.drawsFloat32 = drawsFloat32 && !halfFloat;
     this.filtersFloat32 = gl.getExtension('OES_texture_float_linear') !== null && !halfFloat;
+    const info = gl.getExtension('WEBGL_debug_renderer_info');
+    this.name = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+    this.isSoftware = SOFTWARE.test(this.name);
+    this.planeFormat = this.isSoftware && this.filtersFloat32 && this.drawsFloat32 ? 'rgba32f' : 'rgba16f';
     this.maxTextureSize = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.maxVolumeSize = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
     this.#vertices = this.#made(gl.createVertexArray());
@@ -65,13 +78,6 @@ export class Device {
   /** The objects that are there at present. */
   get objects(): number {
     return this.#objects;
-  }
-
-  /** What draws: the name of the card and its driver, as far as the browser tells it. */
-  get name(): string {
-    const { gl } = this;
-    const info = gl.getExtension('WEBGL_debug_renderer_info');
-    return String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
   }
 
   texture(format: Format, size: readonly number[], isFiltered: boolean): Texture {
@@ -95,15 +101,18 @@ export class Device {
   /** Replace a part of a texture, all of it or the rectangle of `size` texels at (x, y); Uint16 are halves. */
   write(
     texture: Texture,
-    values: Uint8Array | Uint16Array | Float32Array,
+    given: Uint8Array | Uint16Array | Float32Array,
     x = 0,
     y = 0,
     size: readonly number[] = texture.size,
   ): void {
     const { gl } = this;
     const [, layout] = this.#formats(texture.format);
-    const type =
-      values instanceof Uint16Array ? gl.HALF_FLOAT : values instanceof Uint8Array ? gl.UNSIGNED_BYTE : gl.FLOAT;
+    // WebGL does not turn halves into float32 by itself.
+    const isWidened = given instanceof Uint16Array && texture.format === 'rgba32f';
+    const values = isWidened ? Float32Array.from(given, fromHalf) : given;
+    const isHalf = values instanceof Uint16Array;
+    const type = isHalf ? gl.HALF_FLOAT : values instanceof Uint8Array ? gl.UNSIGNED_BYTE : gl.FLOAT;
     this.#resetUnpacking();
     if (texture.size.length === 3) {
       gl.bindTexture(gl.TEXTURE_3D, texture.handle);

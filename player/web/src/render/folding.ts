@@ -31,7 +31,7 @@ export class FoldedPlanes {
     this.#device = device;
     this.#upsampled = device.texture(device.drawsFloat32 ? 'rgba32f' : 'rgba16f', size, false);
     this.#rows = device.texture('rgba32f', [rowWidth(scene, this.layout.upsampling), this.layout.lineCount], false);
-    this.#planes = device.texture('rgba16f', size, true);
+    this.#planes = device.texture(device.planeFormat, size, true);
     this.#upsampleInto = device.framebuffer([this.#upsampled]);
     this.#foldInto = device.framebuffer([this.#planes]);
   }

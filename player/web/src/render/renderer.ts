@@ -61,7 +61,6 @@ const FPS = { card: 30, processor: 10 };
 export const FIRST_RAYS = 0.1;
 /** How fast what is known of it follows what is measured. */
 const NEW_WEIGHT = 0.5;
-const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 const LIVE = ['live', 'other live'];
 const STILL_ROLE = 'still';
 
@@ -111,7 +110,7 @@ export class Renderer {
 
   /** Whether a processor stands in for a graphics card. */
   get isSoftware(): boolean {
-    return SOFTWARE.test(this.#device.name);
+    return this.#device.isSoftware;
   }
 
   /** Whether the browser has taken the card away; it gives it back by itself, and the renderer goes on then. */

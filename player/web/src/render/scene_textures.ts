@@ -32,7 +32,7 @@ export class SceneTextures {
     const { occupancy, motion, head } = scene;
     this.layout = new Layout(scene);
     this.#refuseTooLarge();
-    this.planes = device.texture('rgba16f', [this.layout.width, this.layout.height], true);
+    this.planes = device.texture(device.planeFormat, [this.layout.width, this.layout.height], true);
     const filtered = device.filtersFloat32 ? 'rgba32f' : 'rgba16f';
     this.rows = device.texture(filtered, [head.isDynamic ? rowWidth(scene) : 1, this.layout.lineCount], true);
     this.cells = device.texture('r8ui', occupancy.sizes.slice(1).reverse(), false);
