@@ -31,7 +31,7 @@ class WebReader:
         node = shutil.which("node")
         if node is None or not SCRIPT.is_file():
             raise UsageError("--reader web: needs node, and a checkout of the repository")
-        self._command, self._budget = [node, f"--max-old-space-size={HEAP_MB}", SCRIPT, str(budget)], budget
+        self._command, self._budget = [node, f"--max-old-space-size={HEAP_MB}", str(SCRIPT), str(budget)], budget
         self._process = self._start()
 
     def examined(self, data: bytes, hang_s: float) -> str:

@@ -203,6 +203,8 @@ test('says that another site does not permit the page to read', async () => {
     await assert.rejects(open('http://files.example/scene.kpc', false), hasCode('blocked', 'https'));
     await assert.rejects(open('https://files.example/scene.kpc', false), hasCode('network'));
     await assert.rejects(open('https://page.example/scene.kpc', true), hasCode('network'));
+    global.location = { origin: 'null', href: 'file:///page.html', protocol: 'file:' };
+    await assert.rejects(open('file:///scene.kpc', true), hasCode('blocked', 'kpplay --web'));
   } finally {
     delete global.location;
   }

@@ -214,9 +214,10 @@ export class HttpSource implements Source {
   async #blockade(): Promise<KpcError | null> {
     const { location } = globalThis as { location?: Location };
     const url = new URL(this.#given, location?.href);
-    if (location === undefined || url.origin === location.origin) return null;
+    if (location === undefined) return null;
     const blocked = (why: string) => new KpcError(`${this.name}: ${why}`, 'blocked');
     if (url.protocol === 'file:') return blocked('a page cannot read files of a disk; serve them: kpplay --web');
+    if (url.origin === location.origin) return null;
     try {
       const send = this.#options.fetch ?? globalThis.fetch;
       const probe = await send(url.href, {
