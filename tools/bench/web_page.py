@@ -1,4 +1,4 @@
-"""A page that draws scenes in headless Chromium: player/web/tests/render_page.ts, driven by node."""
+"""Pages in headless Chromium, driven by node: one that draws scenes, player/web/tests/render_page.ts, or another."""
 
 import base64
 import json
@@ -29,21 +29,26 @@ def missing() -> str | None:
         return "needs node"
     if not (WEB / "node_modules" / "playwright-core").is_dir():
         return "needs the packages of player/web: npm ci --prefix player/web"
-    if _browser() is None:
+    if browser() is None:
         return "needs Chromium: apt install chromium (Debian)"
     return None
 
 
-def _browser() -> str | None:
+def browser() -> str | None:
+    """Return the path of Chromium, if it is installed."""
     return shutil.which("chromium") or shutil.which("google-chrome")
 
 
-def run(folder: Path, files: Mapping[str, bytes], calls: Sequence[Call], timeout_s: float = 300) -> list[Any]:
+def run(
+    folder: Path, files: Mapping[str, bytes], calls: Sequence[Call], timeout_s: float = 300, script: str = SCRIPT
+) -> list[Any]:
     """Open the page, with `files` beside it and in `folder`, and return what functions of it return."""
-    return [result["value"] for result in timed(folder, files, calls, timeout_s)]
+    return [result["value"] for result in timed(folder, files, calls, timeout_s, script)]
 
 
-def timed(folder: Path, files: Mapping[str, bytes], calls: Sequence[Call], timeout_s: float) -> list[Any]:
+def timed(
+    folder: Path, files: Mapping[str, bytes], calls: Sequence[Call], timeout_s: float, script: str = SCRIPT
+) -> list[Any]:
     """Return for each call {"value": what it returns, "cpuSeconds": those of all processes of the browser, or None}.
 
     Raises:
@@ -55,10 +60,10 @@ def timed(folder: Path, files: Mapping[str, bytes], calls: Sequence[Call], timeo
         raise UsageError(f"drawing in a browser {reason}")
     for name, data in files.items():
         (folder / name).write_bytes(data)
-    bundle = folder / Path(SCRIPT).with_suffix(".js").name
-    _node("build.mjs", "--page", SCRIPT, "--out", folder, timeout_s=timeout_s)
+    bundle = folder / Path(script).with_suffix(".js").name
+    _node("build.mjs", "--page", script, "--out", folder, timeout_s=timeout_s)
     jobs = json.dumps([{"call": name, "args": arguments} for name, arguments in calls])
-    output = _node("tests/browser.mjs", bundle, folder, str(_browser()), jobs=jobs, timeout_s=timeout_s)
+    output = _node("tests/browser.mjs", bundle, folder, str(browser()), jobs=jobs, timeout_s=timeout_s)
     return list(json.loads(output))
 
 
