@@ -205,6 +205,17 @@ test('a clip that begins elsewhere fetches what is there', async () => {
   });
 });
 
+test('planes may wait until they are wanted', async () => {
+  await withServer(LONG, {}, async (server) => {
+    await withClip(server.url, { position: null }, async (clip) => {
+      await new Promise((resolve) => setTimeout(resolve, 50));
+      assert.equal(server.requests.length, 1);
+      clip.setPlayhead({ time: 0 });
+      await until(clip, () => clip.isSettled);
+    });
+  });
+});
+
 test('a long scene plays in little memory, and what was dropped comes again', async () => {
   const all = new Scene(LONG, core).head.valueCount;
   const pool = { memory: 2 << 20 };

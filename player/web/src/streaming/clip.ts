@@ -27,8 +27,8 @@ const RATE_OVER_S = 1;
 export interface ClipOptions extends Pick<HttpOptions, 'fetch' | 'timeoutMs' | 'firstPauseMs'> {
   /** Bytes that the clip may take, on the graphics card, too. */
   memory?: number;
-  /** Where to begin. */
-  position?: ClipPosition;
+  /** Where to begin; null: planes wait for `setPlayhead`. */
+  position?: ClipPosition | null;
   /** Ends opening. */
   signal?: AbortSignal;
   /** Workers that other clips use, too, or what to start workers with. */
@@ -127,7 +127,8 @@ export class Clip extends EventTarget {
     try {
       source = await sourceOf(src, { ...options, limit: Math.floor(memory / 2) });
       const clip = await Clip.#open(source, pool, ownsPool, memory, signal);
-      clip.setPlayhead(options.position ?? { time: 0 });
+      const { position = { time: 0 } } = options;
+      if (position) clip.setPlayhead(position);
       return clip;
     } catch (error) {
       if (ownsPool) pool.close();
