@@ -18,7 +18,6 @@ import pytest
 from PIL import Image
 
 import kpc
-import web_page
 from kpc.format.common.fidelity import psnr
 from kpc.format.container import groups
 from kpc.format.container.groups import GroupInput
@@ -27,12 +26,15 @@ from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
 from kpc.player.app.controls import OrbitView
 from kpc.player.cpu.reference import render
+from kpc.player.sharing.file_server import Handler, Link, serving
 from kpc.player.viewpoints import presets
-from kpc.tools.cli.serve import Handler, Link, serving
+from kpc.tools.bench import web_page
 
 SAMPLE = Path(__file__).parent.parent.parent / "samples" / "default.kpc"
 SCRIPT = web_page.WEB / "tests" / "element_browser.mjs"
 SCENARIOS = re.findall(r"^ *scenario\(['`](.+)['`], async", SCRIPT.read_text(encoding="utf-8"), re.MULTILINE)
+# A browser that hangs is ended.
+TIMEOUT_S = 400
 # Pictures of pages, to be looked at.
 SCREENSHOTS = web_page.WEB / "build" / "screenshots"
 
@@ -50,7 +52,7 @@ class Faulty(Handler):
             self.answer_with(unquote(self.path.partition("?")[2]).encode(), "Content-Type", "text/html")
             return
         self.fault, _, rest = self.path.lstrip("/").rpartition("/")
-        self.path = f"/{rest}"
+        self.path, self.is_shared = f"/{rest}", self.fault != "refused"
         with self.lock:
             self.count = self.requests[self.fault] = self.requests.get(self.fault, 0) + 1
         if self.fault == "moved":
@@ -87,10 +89,6 @@ class Faulty(Handler):
             return
         super().send(file, count)
 
-    def send_header(self, keyword: str, value: str) -> None:
-        if self.fault != "refused" or not keyword.startswith("Access-Control"):
-            super().send_header(keyword, value)
-
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
@@ -118,7 +116,7 @@ def results(address: str) -> dict[str, Any]:
         pytest.skip(reason)
     SCREENSHOTS.mkdir(parents=True, exist_ok=True)
     command = ["node", SCRIPT, address, str(web_page.browser()), SCREENSHOTS]
-    done = subprocess.run(command, capture_output=True, cwd=web_page.WEB, text=True, timeout=web_page.TIMEOUT_S)
+    done = subprocess.run(command, capture_output=True, cwd=web_page.WEB, text=True, timeout=TIMEOUT_S)
     assert done.returncode == 0, done.stderr[-4000:]
     return dict(json.loads(done.stdout.splitlines()[-1]))
 

@@ -8,12 +8,8 @@
 import assert from 'node:assert/strict';
 import { join } from 'node:path';
 import { chromium } from 'playwright-core';
+import { FLAGS } from './browser_flags.mjs';
 
-const FLAGS = [
-  ...['--headless', '--no-sandbox', '--no-first-run', '--disable-sync'],
-  ...['--disable-background-networking', '--disable-component-update'],
-  ...['--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'],
-];
 const EVENTS = [
   ...['loadstart', 'loadedmetadata', 'progress', 'canplay', 'play', 'playing', 'pause', 'waiting', 'timeupdate'],
   ...['seeking', 'seeked', 'ended', 'error', 'camera-change', 'ratechange', 'volumechange'],
