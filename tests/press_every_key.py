@@ -95,6 +95,10 @@ def keys_of_the_clip(player: Player) -> None:
     assert player.snapshot().time == approx(0.1)
     press(player, glfw.KEY_END)
     assert player.snapshot().time == 1.0
+    press(player, glfw.KEY_DOWN, "m")
+    assert player.state.volume == approx(0.9) and player.state.muted
+    press(player, glfw.KEY_UP)
+    assert player.state.volume == 1.0 and not player.state.muted
     press(player, "]", "l")
     assert player.snapshot().speed == 2.0 and not player.snapshot().loop
 

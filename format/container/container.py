@@ -292,10 +292,11 @@ class Reader:
     index: tuple[Entry, ...]
 
     def __init__(self, source: "AnySource | Reader", *, allow_partial: bool = False):
-        self._reading = threading.Lock()
         if isinstance(source, Reader):
+            self._reading = source._reading
             self.source, self.name, self.header, self.index = source.source, source.name, source.header, source.index
             return
+        self._reading = threading.Lock()
         self.source = open_source(source)
         self.name = self.source.name
         self.header = self._read_header(allow_partial)

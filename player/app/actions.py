@@ -31,6 +31,8 @@ DISPLAY_MODE_NAMES = {
 PART_NAMES = {Part.FULL: "everything", Part.STATIC: "static", Part.DYNAMIC: "dynamic"}
 # Factor between two sizes of the text.
 TEXT_STEP = 1.1
+# Difference between two volumes.
+VOLUME_STEP = 0.1
 NO_PATH = "there is no camera path yet; press K to add a keyframe"
 
 
@@ -78,6 +80,17 @@ class Actions:
     def toggle_loop(self) -> None:
         """Switch looping on or off."""
         self.state.playback.loop = not self.state.playback.loop
+
+    def change_volume(self, steps: int) -> None:
+        """Make the sound louder, or with -1 quieter."""
+        state = self.state
+        state.volume, state.muted = min(max(state.volume + VOLUME_STEP * steps, 0.0), 1.0), False
+        state.notify(f"volume {state.volume:.0%}")
+
+    def toggle_mute(self) -> None:
+        """Switch the sound off or on."""
+        self.state.muted = not self.state.muted
+        self.state.notify("sound off" if self.state.muted else f"volume {self.state.volume:.0%}")
 
     # --- the camera
 

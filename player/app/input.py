@@ -53,6 +53,10 @@ def _faster(do: Actions) -> None:
     do.change_speed(1)
 
 
+def _quieter(do: Actions) -> None:
+    do.change_volume(-1)
+
+
 def _coarser(do: Actions) -> None:
     do.change_quality(-1)
 
@@ -89,6 +93,8 @@ KEY_BINDINGS = (
         elsewhere=(",  .",),
     ),
     KeyBinding("L", "loop on or off", {"l": Actions.toggle_loop}),
+    KeyBinding("Up, Down", "louder or quieter", {"Up": lambda do: do.change_volume(1), "Down": _quieter}),
+    KeyBinding("M", "sound off or on", {"m": Actions.toggle_mute}),
     KeyBinding("R", "back to the view that the file opens with", {"r": Actions.to_opening}),
     KeyBinding("N", "next camera of the scene", {"n": Actions.next_camera}),
     KeyBinding("B", "next viewpoint", {"b": Actions.next_preset}),

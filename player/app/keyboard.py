@@ -16,6 +16,8 @@ KEY_NAMES = {
     glfw.KEY_SPACE: "Space",
     glfw.KEY_LEFT: "Left",
     glfw.KEY_RIGHT: "Right",
+    glfw.KEY_UP: "Up",
+    glfw.KEY_DOWN: "Down",
     glfw.KEY_HOME: "Home",
     glfw.KEY_END: "End",
     glfw.KEY_PAGE_UP: "PageUp",

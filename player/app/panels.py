@@ -40,6 +40,8 @@ from kpc.player.quality import LEVELS
 
 # Messages of the stream stand right of the status panel if so much room is free there, else over it, em.
 MIN_MESSAGE_EM = 12.0
+# Width of what sets the volume, em.
+SOUND_EM = 8.5
 # Frame rates that the slider offers.
 SLIDER_FPS = (5.0, 120.0)
 # Characters of the device's name that are shown.
@@ -192,7 +194,8 @@ class Panels:
                 self.state.follower.is_active = False
                 playback.toggle()
             imgui.same_line()
-            imgui.set_next_item_width(max(imgui.get_content_region_avail()[0] - em(13.5), em(4)))
+            others = em(13.5 + (SOUND_EM if self.state.stream.has_sound else 0.0))
+            imgui.set_next_item_width(max(imgui.get_content_region_avail()[0] - others, em(4)))
             text = f"{playback.time * clip.duration_s:.2f} / {clip.total_s:.2f} s"
             changed, time = imgui.slider_float("##time", playback.time, 0.0, 1.0, text, imgui.SliderFlags.NO_INPUT)
             if changed:
@@ -204,7 +207,25 @@ class Panels:
                 playback.speed = SPEEDS[chosen]
             imgui.same_line()
             _, playback.loop = imgui.checkbox("loop", playback.loop)
+            if self.state.stream.has_sound:
+                self._volume()
             return bottom - imgui.get_window_height()
+
+    def _volume(self) -> None:
+        """The volume, and whether sound is on, beside the other controls of the clip."""
+        state = self.state
+        imgui.same_line()
+        changed, is_on = imgui.checkbox("sound", not state.muted)
+        if changed:
+            state.muted = not is_on
+        tip("Sound off or on (M)")
+        imgui.same_line()
+        imgui.set_next_item_width(em(SOUND_EM - 3))
+        text = "sound off" if state.muted else f"{state.volume:.0%}".replace("%", "%%")
+        changed, volume = imgui.slider_float("##volume", state.volume, 0.0, 1.0, text, imgui.SliderFlags.NO_INPUT)
+        if changed:
+            state.volume, state.muted = volume, False
+        tip("Louder or quieter (Up, Down)")
 
     def _graphs(self, top: float) -> float:
         """Times between frames and of their pictures, on the right, below `top`; return the lower edge."""

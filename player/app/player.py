@@ -23,6 +23,8 @@ from kpc.player.app.widgets import message
 from kpc.player.app.window import Window
 from kpc.player.gl.renderer import is_software
 from kpc.player.quality import neighbouring_level
+from kpc.player.sound.clip_samples import ClipSamples
+from kpc.player.sound.playback import SoundPlayback
 from kpc.player.streaming.group_playback import GroupPlayback
 from kpc.player.streaming.prefetch import Playhead
 
@@ -104,6 +106,7 @@ class Player:
         scene_view: the picture of the scene.
         actions: what keys and panels do.
         filming: the video that is written.
+        sound: what is heard of the clip.
     """
 
     def __init__(
@@ -128,6 +131,7 @@ class Player:
         self.scene_view = SceneView(window.ctx, self.state, window.pixels)
         self.files = OutputFiles(folder, stream.source.name)
         self.filming = Filming(self.state, self.scene_view, self.files)
+        self.sound = SoundPlayback(ClipSamples(stream.groups), stream.clip.duration_s)
         self.actions = Actions(
             self.state, self.scene_view, self.filming, self.files, playlist or Playlist([stream.source.name])
         )
@@ -240,7 +244,10 @@ class Player:
         self.scene_view.invalidate()
 
     def close(self) -> str | None:
-        """Finish the video that is being written and release the panels; return what to report of the video."""
+        """End the sound, finish the video that is being written and release the panels; return what to report of the
+        video.
+        """
+        self.sound.close()
         report = self.filming.close()
         self.window.io = None
         self.imgui.close()
@@ -319,7 +326,9 @@ class Player:
         """Advance the clip, or the camera along its path, unless what would be shown has not arrived yet."""
         state, follower = self.state, self.state.follower
         seconds = min(seconds, MAX_ADVANCE_S)
-        playback, position_s, view = state.playback.after(seconds), follower.position_s, state.view
+        clip_s, plays = state.stream.clip.duration_s, self._plays_sound
+        clip_seconds = self.sound.advance(seconds, state.playback.time * clip_s) if plays else seconds
+        playback, position_s, view = state.playback.after(clip_seconds), follower.position_s, state.view
         follows = follower.is_active
         if self.filming.is_along_path:
             playback = replace(playback, time=self.filming.path_time)
@@ -330,10 +339,25 @@ class Player:
         state.stream.set_playhead(Playhead(playback.time, state.playback.rate, state.playback.loop))
         state.stream.upload()
         state.follow_scene()
-        if state.stream.can_show(playback.time, state.playback.rate):
+        is_shown = state.stream.can_show(playback.time, state.playback.rate)
+        if is_shown:
             state.shown = state.shown if view is state.view else None
             state.playback, state.view = playback, view
             follower.position_s, follower.is_active = position_s, follows
+        plays = plays and is_shown and state.playback.playing
+        self.sound.follow(state.playback.time * clip_s, plays=plays, loops=state.playback.loop)
+        self.sound.set_volume(0.0 if state.muted else state.volume)
+        if self.sound.notice is not None:
+            state.notify(self.sound.notice)
+            self.sound.notice = None
+
+    @property
+    def _plays_sound(self) -> bool:
+        """Whether the clip runs as it is heard: at its own speed, on no camera path."""
+        state = self.state
+        is_natural = state.playback.playing and state.playback.speed == 1.0
+        is_on_path = state.follower.is_active or self.filming.is_along_path
+        return state.stream.has_sound and is_natural and not is_on_path
 
     def _announce(self, name: str) -> None:
         """Show at once that the scene is being prepared: compiling what draws it may take a minute the first time."""

@@ -39,6 +39,7 @@ class Preferences:
         controls, graphs, planes: whether these panels are shown.
         text_size: of the panels, 1 for the system's text size.
         recent: paths and addresses of the files that were opened lately, the latest first.
+        volume: of sound, 0 to 1; muted: whether it is off.
     """
 
     size: tuple[int, int] | None = None
@@ -49,6 +50,8 @@ class Preferences:
     planes: bool = False
     text_size: float = 1.0
     recent: tuple[str, ...] = ()
+    volume: float = 1.0
+    muted: bool = False
 
 
 def _is_between(low: float, high: float) -> Callable[[Any], bool]:
@@ -75,6 +78,8 @@ _IS_VALID: dict[str, Callable[[Any], bool]] = {
     "graphs": _is_bool,
     "planes": _is_bool,
     "text_size": _is_between(*TEXT_SIZES),
+    "volume": _is_between(0.0, 1.0),
+    "muted": _is_bool,
     "recent": _is_recent,
 }
 

@@ -124,6 +124,7 @@ class PlayerState:
         follower: the camera path.
         visible: the panels that are shown.
         text_size: of the panels; 1 is the system's text size.
+        volume: of sound, 0 to 1; muted: whether it is off.
         should_close: whether the player is to end.
     """
 
@@ -146,6 +147,7 @@ class PlayerState:
         self.part, self.display_mode, self.exact = Part.FULL, DisplayMode.COLOUR, False
         self.visible = VisiblePanels(preferences.controls, preferences.graphs, preferences.planes)
         self.text_size = preferences.text_size
+        self.volume, self.muted = preferences.volume, preferences.muted
         self.statistics, self.notice = FrameStatistics(), Notice()
         self.should_close = False
 
@@ -163,6 +165,7 @@ class PlayerState:
         self.follower = before.follower
         self.follower.is_active = False
         self.appearance.select(before.appearance.number)
+        self.volume, self.muted = before.volume, before.muted
         self.visible.controls, self.visible.path = before.visible.controls, before.visible.path
 
     def preferences(self, window_size: tuple[int, int]) -> Preferences:
@@ -176,6 +179,8 @@ class PlayerState:
             graphs=self.visible.graphs,
             planes=self.visible.planes,
             text_size=self.text_size,
+            volume=self.volume,
+            muted=self.muted,
         )
 
     def play_like(self, before: Playback) -> None:

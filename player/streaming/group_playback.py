@@ -137,6 +137,11 @@ class GroupPlayback:
         return self.timeline.clip_time(self.number, time_in_group)
 
     @property
+    def has_sound(self) -> bool:
+        """Whether the group that is shown has sound."""
+        return self.stream.has_sound
+
+    @property
     def complete_scales(self) -> int:
         """See `Stream.complete_scales`."""
         return self.stream.complete_scales

@@ -35,6 +35,9 @@ RUN_BYTES, RUN_CHUNKS = 1 << 18, 256
 UPLOAD_BYTES = 1 << 22
 # Seconds of the clip that must have arrived before playback continues after it had to wait.
 RESUME_S = 0.5
+# Bytes that the sound of a clip takes while it is played (`kpc.player.sound.playback`): what is decoded ahead, and
+# packets.
+SOUND_BYTES = 1 << 23
 # Seconds over which the rate of arriving bytes is averaged.
 RATE_OVER_S = 1.0
 
@@ -232,7 +235,7 @@ class Stream:
         """Bytes that the scene takes besides segments of time planes.
 
         They are those of the renderer without pictures, of occupancy and motion, of planes that wait to be uploaded and
-        one that is being decoded, and of the source.
+        one that is being decoded, of the source, and of sound.
         """
         scene, layout = self.scene, self._layout
         largest = max(layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
@@ -242,7 +245,13 @@ class Stream:
         source = (
             self.source.size if whole else 2 * (RUN_BYTES + max(entry.stored_length for entry in self._reader.index))
         )
-        return Renderer.bytes_for(scene) + scene.occupancy.nbytes + motion + decoding + source
+        sound = SOUND_BYTES if self.has_sound else 0
+        return Renderer.bytes_for(scene) + scene.occupancy.nbytes + motion + decoding + source + sound
+
+    @property
+    def has_sound(self) -> bool:
+        """Whether the file has sound, which `kpc.player.sound` fetches beside the planes."""
+        return bool(self._reader.sound_numbers)
 
     @property
     def failure(self) -> str | None:
