@@ -53,7 +53,7 @@ class Body:
 
 def bodies() -> list[Body]:
     """Return the bodies of the valid conformance vectors."""
-    found = []
+    found: list[Body] = []
     for path, data in specvectors.files().items():
         if path.startswith("valid/") and Path(path).stem not in LONG:
             try:
@@ -75,7 +75,7 @@ def _bodies_of(name: str, reader: SceneReader) -> Iterator[Body]:
             plane = reader.head.scales[entry.scale][ALL_PLANES[entry.plane]]
             rows = range(entry.row_start, entry.row_start + entry.row_count)
             projected = project_occupancy(reader.occupancy(), ALL_PLANES[entry.plane])
-            decode = partial(
+            decode: Callable[[bytes], object] = partial(
                 decoding.decode_segment,
                 Codec.RAW if is_raw else entry.codec,
                 rows=len(rows),
@@ -86,8 +86,7 @@ def _bodies_of(name: str, reader: SceneReader) -> Iterator[Body]:
             )
             yield Body(title, reader.chunk(number) if is_raw else reader.context_coded(number), decode)
         elif not is_raw:
-            function = FUNCTIONS[entry.kind]
-            decode = partial(function, raw_length=entry.raw_length, memory_limit=BUDGET)
+            decode = partial(FUNCTIONS[entry.kind], raw_length=entry.raw_length, memory_limit=BUDGET)
             yield Body(title, reader.context_coded(number), decode)
 
 
