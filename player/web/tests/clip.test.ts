@@ -45,7 +45,7 @@ async function withClip(
   body: (clip: Clip) => Promise<void>,
 ): Promise<void> {
   const pool = { size: 2, spawn: spawnNode, ...options.pool };
-  const clip = await Clip.open(src, { firstPauseMs: 5, timeoutMs: 500, ...options, pool });
+  const clip = await Clip.open(src, { firstPauseMs: 5, ...options, pool });
   try {
     await body(clip);
   } finally {
@@ -149,7 +149,7 @@ test('the coarse picture comes first, then a finer one, then what is ahead', asy
   const { index } = new Container(LONG);
   const finer = index.findIndex((entry) => entry.scale === 1);
   await withServer(LONG, { allowed: index[finer + 2].offset }, async (server) => {
-    await withClip(server.url, { timeoutMs: 10_000 }, async (clip) => {
+    await withClip(server.url, {}, async (clip) => {
       clip.setPlayhead({ time: 0, rate: 1 });
       const scales: number[] = [];
       const [stream] = clip.scenes;
@@ -198,7 +198,7 @@ test('a jump fetches what the picture needs before what lies in between', async 
 
 test('a clip that begins elsewhere fetches what is there', async () => {
   await withServer(LONG, { allowed: 200_000 }, async (server) => {
-    await withClip(server.url, { position: { time: 70 }, timeoutMs: 10_000 }, async (clip) => {
+    await withClip(server.url, { position: { time: 70 } }, async (clip) => {
       await until(clip, () => clip.canShow(70));
       assert.ok(!clip.canShow(20));
     });

@@ -8,7 +8,7 @@ import { type HttpOptions, HttpSource } from '../src/streaming/http.js';
 import { withServer } from './server.js';
 
 const BYTES = Uint8Array.from({ length: 200_000 }, (_, k) => (k * 2654435761) >>> 24);
-const FAST: HttpOptions = { firstPauseMs: 5, timeoutMs: 300 };
+const FAST: HttpOptions = { firstPauseMs: 5 };
 
 const hasCode =
   (code: ErrorCode, words = '') =>
@@ -111,8 +111,8 @@ test('asks again after failures that pass, and gives up in the end', async () =>
     source.close();
   });
   await withServer(BYTES, { hangs: 1 }, async (server) => {
-    const source = await HttpSource.open(server.url, FAST);
-    assert.equal(server.requests.length, 2);
+    const source = await HttpSource.open(server.url, { ...FAST, timeoutMs: 300 });
+    assert.ok(server.requests.length > 1);
     source.close();
     server.close();
     await assert.rejects(HttpSource.open(server.url, FAST), hasCode('network'));
