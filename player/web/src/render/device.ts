@@ -36,6 +36,12 @@ export interface Program {
   readonly uniforms: ReadonlyMap<string, { type: number; location: WebGLUniformLocation }>;
 }
 
+/** A program that is being compiled. */
+export interface Compilation {
+  readonly handle: WebGLProgram;
+  readonly stages: readonly { shader: WebGLShader; files: string[] }[];
+}
+
 const BYTES: Record<Format, number> = { rgba32f: 16, rgba16f: 8, rgba8: 4, rg32f: 8, rg16f: 4, r8ui: 1 };
 
 export const bytesOf = ({ format, size }: Texture): number => BYTES[format] * size.reduce((a, b) => a * b);
@@ -55,6 +61,7 @@ export class Device {
   readonly planeFormat: 'rgba16f' | 'rgba32f';
   #objects = 0;
   readonly #vertices: WebGLVertexArrayObject;
+  readonly #parallel: KHR_parallel_shader_compile | null;
 
   constructor(
     readonly gl: WebGL2RenderingContext,
@@ -70,6 +77,7 @@ export class Device {
     this.name = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
     this.isSoftware = SOFTWARE.test(this.name);
     this.planeFormat = this.isSoftware && this.filtersFloat32 && this.drawsFloat32 ? 'rgba32f' : 'rgba16f';
+    this.#parallel = gl.getExtension('KHR_parallel_shader_compile');
     this.maxTextureSize = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.maxVolumeSize = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
     this.#vertices = this.#made(gl.createVertexArray());
@@ -141,8 +149,8 @@ export class Device {
     return { handle, width, height };
   }
 
-  /** Compile a fragment shader that is drawn over a whole viewport. */
-  program(name: string, defines: Defines, written: Written): Program {
+  /** Begin to compile a fragment shader that is drawn over a whole viewport. */
+  compile(name: string, defines: Defines, written: Written): Compilation {
     const { gl } = this;
     const handle = this.#made(gl.createProgram());
     const stages = [
@@ -156,6 +164,17 @@ export class Device {
       return { shader, files };
     });
     gl.linkProgram(handle);
+    return { handle, stages };
+  }
+
+  /** Whether a program is compiled, so that `program` does not wait; true where the browser does not tell. */
+  isCompiled({ handle }: Compilation): boolean {
+    return this.#parallel === null || this.gl.getProgramParameter(handle, this.#parallel.COMPLETION_STATUS_KHR);
+  }
+
+  /** Return what has been compiled; wait for it if necessary. */
+  program({ handle, stages }: Compilation): Program {
+    const { gl } = this;
     const isLinked = gl.getProgramParameter(handle, gl.LINK_STATUS) || gl.isContextLost();
     const failed = stages.find(({ shader }) => !gl.getShaderParameter(shader, gl.COMPILE_STATUS)) ?? stages[1];
     const log = isLinked ? '' : gl.getShaderInfoLog(failed.shader) || gl.getProgramInfoLog(handle) || 'does not link';

@@ -2,7 +2,7 @@
 
 import { type Camera, columnsOf } from './camera.js';
 import type { Device, Framebuffer } from './device.js';
-import { FoldedPlanes } from './folding.js';
+import { FOLDING, FoldedPlanes } from './folding.js';
 import type { Quality } from './quality.js';
 import { extentOf, type SceneSource } from './scene_source.js';
 import { Programs, SceneTextures } from './scene_textures.js';
@@ -59,30 +59,43 @@ export class DrawnScene {
     return this.#parts;
   }
 
+  /** Whether a picture can be drawn without waiting for compilers; have them begin if not. */
+  isReady(device: Device, quality: Quality, isMoving: boolean): boolean {
+    const parts = this.#on(device);
+    const { folded, layout, defines } = this.#way(parts, quality, isMoving, false);
+    const areReady = [
+      parts.programs.isReady('march.glsl', layout, defines),
+      ...(folded ? FOLDING : []).map((name) => parts.programs.isReady(name, parts.textures.layout, {})),
+    ];
+    return areReady.every((isReady) => isReady);
+  }
+
+  /** Return how to march: through folded planes or not, their layout, and the macros of march.glsl. */
+  #way(parts: Parts, quality: Quality, isWhole: boolean, isCounted: boolean) {
+    const { textures, programs } = parts;
+    const isMoving = isWhole && this.source.head.isDynamic;
+    if (isMoving && quality.folded) parts.folded ??= new FoldedPlanes(textures, programs);
+    const folded = isMoving && quality.folded ? parts.folded : null;
+    const defines = {
+      ROWS: Number(isMoving && !folded),
+      MOTION: Number(isMoving && textures.motion !== null),
+      COUNTED: Number(isCounted),
+    };
+    return { folded, layout: folded?.layout ?? textures.layout, defines };
+  }
+
   /** March the rays of a target, or those of its rows from `firstRow` on, from below. */
   march(device: Device, target: Framebuffer, shot: Shot, firstRow = 0, rowCount = target.height): void {
     const parts = this.#on(device);
     const { textures, programs } = parts;
     const { head } = this.source;
     const { camera, time, quality, appearance } = shot;
-    const isMoving = shot.isMoving && head.isDynamic;
-    const isFolded = isMoving && quality.folded;
-    const isDisplaced = isMoving && textures.motion !== null;
+    const way = this.#way(parts, quality, shot.isMoving, shot.isCounted ?? false);
     textures.setOccupancy(time);
-    if (isDisplaced) textures.setMotion(time);
-    let { planes, layout } = textures;
-    if (isFolded) {
-      parts.folded ??= new FoldedPlanes(textures, programs);
-      planes = parts.folded.at(time);
-      layout = parts.folded.layout;
-    } else if (isMoving) {
-      textures.setTimeRows(time);
-    }
-    const program = programs.get('march.glsl', layout, {
-      ROWS: Number(isMoving && !isFolded),
-      MOTION: Number(isDisplaced),
-      COUNTED: Number(shot.isCounted ?? false),
-    });
+    if (way.defines.MOTION) textures.setMotion(time);
+    if (way.defines.ROWS) textures.setTimeRows(time);
+    const planes = way.folded ? way.folded.at(time) : textures.planes;
+    const program = programs.get('march.glsl', way.layout, way.defines);
     const stride = head.rayStep * quality.step;
     const columns = columnsOf(camera.pose);
     device.set(program, {

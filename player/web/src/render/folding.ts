@@ -4,6 +4,8 @@ import { isFoldedAlongRows, Layout, rowWidth, timeRows } from './atlas.js';
 import { bytesOf, type Device, type Framebuffer, type Texture } from './device.js';
 import { type Programs, type SceneTextures, UNIT } from './scene_textures.js';
 
+/** The shaders that fold. */
+export const FOLDING = ['upsample_plane.glsl', 'fold.glsl'] as const;
 const UPSAMPLING = 2;
 const LARGEST_HALF = 65504;
 
@@ -55,7 +57,7 @@ export class FoldedPlanes {
   at(time: number): Texture {
     if (!this.#isUpsampled) {
       this.#device.use(this.textures.planes, UNIT.planes);
-      this.#drawBlocks('upsample_plane.glsl', this.#upsampleInto);
+      this.#drawBlocks(FOLDING[0], this.#upsampleInto);
       this.#isUpsampled = true;
     }
     const { scene, layout } = this.textures;
@@ -64,7 +66,7 @@ export class FoldedPlanes {
       this.#device.write(this.#rows, timeRows(scene, layout, time, this.layout.upsampling));
       this.#device.use(this.#upsampled, UNIT.planes);
       this.#device.use(this.#rows, UNIT.rows);
-      this.#drawBlocks('fold.glsl', this.#foldInto);
+      this.#drawBlocks(FOLDING[1], this.#foldInto);
       this.#folded = key;
     }
     return this.#planes;

@@ -104,7 +104,9 @@ export class Presentation {
 
   #program(name: string, defines: Defines = {}): Program {
     const key = JSON.stringify([name, defines]);
-    const program = this.#programs.get(key) ?? this.device.program(name, { CONTRACTED: 0, NDC: 0, ...defines }, {});
+    const program =
+      this.#programs.get(key) ??
+      this.device.program(this.device.compile(name, { CONTRACTED: 0, NDC: 0, ...defines }, {}));
     this.#programs.set(key, program);
     return program;
   }

@@ -13,7 +13,7 @@ import { DrawnScene } from './drawn_scene.js';
 import { Pace, type Rung } from './pace.js';
 import { type Keeping, type Moment, type Picture, PictureJob, type ShownPart, type View } from './picture_job.js';
 import { Presentation, type Screen } from './presentation.js';
-import type { Level } from './quality.js';
+import { LEVELS, type Level } from './quality.js';
 import type { SceneSource } from './scene_source.js';
 import { Timer } from './timer.js';
 
@@ -173,7 +173,9 @@ export class Renderer {
       }
       // What was sharp stays so while more planes arrive.
       const sharpens = isAuto && (isShown || (isStill && this.#shown?.rung === STILL));
-      this.#job = this.#newJob(view, sharpens ? STILL : wanted);
+      const rung = sharpens ? STILL : wanted;
+      if (!this.#isReady(view, rung)) return this.#state(wanted, false);
+      this.#job = this.#newJob(view, rung);
       this.#job.versions = versions;
     }
     this.#goOn(this.#job, isAuto, options.screen ?? null);
@@ -225,6 +227,15 @@ export class Renderer {
     this.#timer.dispose();
     this.#presentation.release();
     this.#device.dispose();
+  }
+
+  /** Whether no compiler keeps a picture waiting. */
+  #isReady({ moments, part }: View, { level }: Rung): boolean {
+    const parts = { all: [true], static: [false], dynamic: [true, false] }[part];
+    const areReady = moments.flatMap(({ scene }) =>
+      parts.map((isMoving) => scene.isReady(this.#device, LEVELS[level], isMoving)),
+    );
+    return areReady.every((isReady) => isReady);
   }
 
   #newJob(view: View, rung: Rung): PictureJob {

@@ -2,7 +2,7 @@
 
 import { displacementsAt, emptyDistances, Layout, rowWidth, timeRows } from './atlas.js';
 import { columnsOf } from './camera.js';
-import { bytesOf, type Device, type Program, RenderError, type Texture } from './device.js';
+import { bytesOf, type Compilation, type Device, type Program, RenderError, type Texture } from './device.js';
 import { occupancySlot, type PlaneRows, type SceneSource, type SpacePlane } from './scene_source.js';
 import { constants, type Defines } from './shader.js';
 import { blockArrays, decoderArrays, decoderShape, planesShape } from './shader_constants.js';
@@ -106,6 +106,9 @@ export class SceneTextures {
   }
 }
 
+const keyOf = (name: string, { upsampling }: Layout, defines: Defines) =>
+  [name, upsampling, ...Object.entries(defines).flat()].join(' ');
+
 /** Return the macros that describe a scene whose planes lie in a layout. */
 export function sceneDefines(scene: SceneSource, layout: Layout): Defines {
   return {
@@ -120,6 +123,7 @@ export function sceneDefines(scene: SceneSource, layout: Layout): Defines {
 /** The programs of a scene, compiled when they are first needed, with all uniforms set that never change. */
 export class Programs {
   readonly #decoderWeights: string;
+  readonly #compilations = new Map<string, Compilation>();
   readonly #programs = new Map<string, Program>();
 
   constructor(
@@ -135,18 +139,35 @@ export class Programs {
     this.#decoderWeights = constants(arrays);
   }
 
+  /** Whether a program is compiled; begin with it if not. */
+  isReady(name: string, layout: Layout, defines: Defines): boolean {
+    return (
+      this.#programs.has(keyOf(name, layout, defines)) || this.device.isCompiled(this.#begun(name, layout, defines))
+    );
+  }
+
   /** Return a program that reads planes in a layout; `defines` besides those that describe the scene. */
   get(name: string, layout: Layout, defines: Defines = {}): Program {
-    const key = [name, layout.upsampling, ...Object.entries(defines).flat()].join(' ');
+    const key = keyOf(name, layout, defines);
     const known = this.#programs.get(key);
+    if (known !== undefined) return known;
+    const program = this.device.program(this.#begun(name, layout, defines));
+    this.#compilations.delete(key);
+    this.#programs.set(key, program);
+    this.#setConstant(program);
+    return program;
+  }
+
+  #begun(name: string, layout: Layout, defines: Defines): Compilation {
+    const key = keyOf(name, layout, defines);
+    const known = this.#compilations.get(key);
     if (known !== undefined) return known;
     const { scene } = this.textures;
     const macros = { ...sceneDefines(scene, layout), COMPUTE: 0, COUNTED: 0, ...defines };
     const written = { decoder_weights: this.#decoderWeights, plane_blocks: constants(blockArrays(scene, layout)) };
-    const program = this.device.program(name, macros, written);
-    this.#setConstant(program);
-    this.#programs.set(key, program);
-    return program;
+    const compilation = this.device.compile(name, macros, written);
+    this.#compilations.set(key, compilation);
+    return compilation;
   }
 
   #setConstant(program: Program): void {
@@ -172,6 +193,8 @@ export class Programs {
   }
 
   release(): void {
+    for (const { handle } of this.#compilations.values()) this.device.release({ handle, uniforms: new Map() });
+    this.#compilations.clear();
     for (const program of this.#programs.values()) this.device.release(program);
     this.#programs.clear();
   }
