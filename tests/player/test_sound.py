@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +13,11 @@ from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import FormatError, MediaError
 from kpc.format.container.clip_sound import sample_at
 from kpc.format.container.groups import GroupInput, Groups, write
+from kpc.format.container.sources import open_source
 from kpc.format.scene.scene import Clip
 from kpc.format.scene.sound import SAMPLE_RATE
 from kpc.player.app.controls import Playback
+from kpc.player.sharing.file_server import Handler, serving
 from kpc.player.sound import device
 from kpc.player.sound.clip_samples import ClipSamples
 from kpc.player.sound.playback import AHEAD_S, APART_S, SoundPlayback
@@ -218,6 +221,25 @@ def test_samples_of_a_file_are_those_of_a_decoder_that_never_stopped(files):
             error = np.abs(samples.read(first, 3000)[:, 0] - files[2][first : first + 3000])
             assert error.max() < 0.005, (file, first)
         assert not samples.read(4 * SAMPLE_RATE + 10, 100).any()
+
+
+@pytest.mark.parametrize("has_ranges", [True, False])
+def test_samples_come_from_a_server_beside_the_planes(files, has_ranges):
+    class Server(Handler):
+        def send_head(self) -> object:
+            if not has_ranges:
+                del self.headers["Range"]
+            return super().send_head()
+
+    folder = Path(files[1]).parent
+    (folder / "scene.kpc").write_bytes(files[0])
+    with serving(folder, handler=Server) as url:
+        for name in ("scene.kpc", "clip.kpc"):
+            source = open_source(f"{url}/{name}")
+            samples = ClipSamples(Groups(source, in_parts=True))
+            assert np.abs(samples.read(100_000, 4000)[:, 0] - files[2][100_000:104_000]).max() < 0.005
+            samples.close()
+            source.close()
 
 
 def test_the_system_has_a_device_or_says_that_it_has_none():
