@@ -7,13 +7,22 @@ from collections.abc import Callable
 # Constants by their full names.
 SETTINGS = {
     "kpc.encoder.evaluation.validation_rays.VALIDATION_RAYS": 512,
-    "kpc.encoder.rdo.curvature.RAYS": 1 << 13,
+    "kpc.encoder.rdo.curvature.RAYS": 1 << 11,
     "kpc.encoder.rdo.codec_model.BLOCK_SIDES": (8,),
     "kpc.encoder.rdo.codec_model.TOLERANCE": 0.05,
     "kpc.encoder.rdo.dct_rdo.PASSES": 2,
+    "kpc.encoder.rdo.occupancy_rdo.FEWER_RAYS": 1 << 11,
+    "kpc.encoder.rdo.occupancy_rdo.RAYS": 1 << 11,
     "kpc.encoder.rdo.rate_search.MAX_ATTEMPTS": 6,
     "kpc.encoder.rdo.trellis.PASSES": 2,
-    "kpc.format.scene.view_limits.STEP": math.radians(20),
+    "kpc.format.scene.view_limits.FARTHER": (1.5,),
+    "kpc.format.scene.view_limits.JUDGED_WIDTH": 10,
+    "kpc.format.scene.view_limits.MOST_CAMERAS": 6,
+    "kpc.format.scene.view_limits.NEARER": (0.7,),
+    "kpc.format.scene.view_limits.OPENING_ZOOMS": (1.0, 1.2, 1.5),
+    "kpc.format.scene.view_limits.REACHES": (0.1, 0.3),
+    "kpc.format.scene.view_limits.SEEN_WIDTH": 20,
+    "kpc.format.scene.view_limits.STEP": math.radians(40),
 }
 
 

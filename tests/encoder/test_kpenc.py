@@ -26,19 +26,38 @@ from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.datasets import pixel_cache
 from kpc.encoder.evaluation.preview import Preview
 from kpc.encoder.field.config import PRESETS
+from kpc.encoder.rdo import codec_model
+from kpc.encoder.rdo.curvature import PerPlane
 from kpc.encoder.training.train import Trainer
+from kpc.format.coding.quantise import QuantisedScene, quantise_scene
 from kpc.format.common import cli
 from kpc.format.container import scene_io
-from kpc.format.scene.scene import HybridDecoder
+from kpc.format.scene.scene import HybridDecoder, Scene
 from kpc.format.scene.space import DeviceCoordinates
 from training_runs import TINY
 
-pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding", "tiny", "heeded_signals")
+pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding", "rounded", "tiny", "heeded_signals")
 
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PRESETS, "draft", TINY)
+
+
+@pytest.fixture
+def searched() -> None:
+    """Search for symbols of least cost."""
+
+
+@pytest.fixture
+def rounded(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Round to symbols instead of searching for them, which takes half of the time, where a test has not `searched`."""
+
+    def rounding(scene: Scene, steps: PerPlane, looked_up: np.ndarray, *_: object, **__: object) -> QuantisedScene:
+        return quantise_scene(scene, steps, reached=looked_up)
+
+    if "searched" not in request.fixturenames:
+        monkeypatch.setattr(codec_model, "quantise_by_cost", rounding)
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +119,7 @@ def fails(
 # --- it works
 
 
+@pytest.mark.usefixtures("searched")
 @pytest.mark.parametrize(
     "name, layout, dynamic, steps",
     [
@@ -134,7 +154,7 @@ def test_a_folder_becomes_a_file(
 
 
 @pytest.mark.parametrize("name", ["n3dv", "blender"])
-def test_the_hybrid_decoder(run: Kpenc, sets: Path, tmp_path: Path, name: str) -> None:
+def test_the_hybrid_decoder(run: Kpenc, searched: None, sets: Path, tmp_path: Path, name: str) -> None:
     code, out, err = run(sets / name, "--json", "--decoder", "hybrid")
     assert code == 0 and "hybrid decoder" in err
     decoder = scene_io.read(tmp_path / "out.kpc").decoder
@@ -241,6 +261,7 @@ def test_masks_and_the_error_for_a_damaged_model(run: Kpenc, sets: Path, tmp_pat
     fails(run, tmp_path, folder, "images.bin", "it ends early")
 
 
+@pytest.mark.usefixtures("searched")
 @pytest.mark.parametrize("share", [1.0, 0.0])
 def test_pruning_is_logged_and_reduces_the_file(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
@@ -266,7 +287,7 @@ def test_a_time_budget(run: Kpenc, sets: Path) -> None:
     assert code == 0 and 0.5 <= result["train_s"] < 10
 
 
-def test_a_seed_gives_the_same_bytes(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+def test_a_seed_gives_the_same_bytes(run: Kpenc, searched: None, sets: Path, tmp_path: Path) -> None:
     written = []
     for seed in ("4", "4", "5"):
         assert run(sets / "nerfstudio", "--seed", seed, "--steps", "10", "--test-views", "all")[0] == 0
@@ -762,7 +783,7 @@ def _subprocess(argv: list[str], preparation: str) -> subprocess.Popen[str]:
     )
 
 
-def test_rate_distortion_targets(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+def test_rate_distortion_targets(run: Kpenc, searched: None, sets: Path, tmp_path: Path) -> None:
     """The kept checkpoint is coded anew, without a step of training."""
     _, out, _ = run(sets / "n3dv", "--keep", "--json")
     usual = json.loads(out)["size_bytes"]
