@@ -4,7 +4,7 @@ import math
 import struct
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -41,8 +41,9 @@ Refused = tuple[bytes, str, str]  # a file, the name of the error, a part of its
 NAN = float("nan")
 
 
+@cache
 def invalid() -> dict[str, Refused]:
-    """Return all vectors but those of groups."""
+    """Return all vectors but those of groups; one process makes them once."""
     good = Good()
     small = Small()
     return (

@@ -9,6 +9,7 @@ depend on the version of that library, and only in how they are packed (manifest
 
 import hashlib
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +42,9 @@ def vectors() -> dict[str, bytes]:
     return files() | {"manifest.json": manifest_json(manifest())}
 
 
+@cache
 def files() -> dict[str, bytes]:
-    """Return the .kpc files: path -> content."""
+    """Return the .kpc files: path -> content; one process makes them once."""
     scenes = valid() | metadata_vectors.valid() | sound_vectors.valid()
     whole = {name: data for name, (data, partial) in scenes.items() if not partial}
     found = {f"valid/{name}.kpc": data for name, (data, _) in (scenes | group_vectors.valid(whole)).items()}

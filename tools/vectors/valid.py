@@ -1,7 +1,7 @@
 """The valid conformance vectors: by name, a file and whether it is a prefix of one."""
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -70,8 +70,9 @@ def extremes(shape: tuple[int, int, int], seed: int) -> np.ndarray:
     return np.where(noise(shape, seed) < 0, -128, 127)
 
 
+@cache
 def valid() -> dict[str, Vector]:
-    """Return all vectors but those of groups."""
+    """Return all vectors but those of groups; one process makes them once."""
     dynamic = make_scene(dynamic=True, sizes=[(2, 5, 4, 3, 3), (4, 9, 8, 7, 6)], cameras=2)
     dense = replace(
         make_scene(dynamic=True, sizes=[(2, 9, 8, 7, 3)], cameras=1), occupancy=noise((2, 3, 3, 5), 98) > -64
