@@ -264,8 +264,11 @@ def test_stream_measures_loading_and_seeking(
     assert "seek_ms" not in second["repeats"][0]
 
 
-def test_records_before_a_failure_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_records_before_a_failure_are_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     gl.context()
+    monkeypatch.setattr(harness, "isolated", lambda work, job: work(job))
     good, bad = tiny_file(tmp_path / "good.kpc", False), tmp_path / "bad.kpc"
     bad.write_bytes(b"nonsense")
     assert kpbench.main(["player", str(good), str(bad), "--size", "8x6", "--frames", "1"]) == 1
