@@ -45,8 +45,8 @@ def test_the_diagonal_predicts_the_effect_of_small_errors(kind: str, monkeypatch
     monkeypatch.setattr(
         module, "RAYS_PER_GRADIENT", 16
     )  # so few rays: hardly any cross terms, that they need not cancel
-    validation, rng = validation_rays_of(scene, 2000), np.random.default_rng(0)
-    h = estimate_curvature(scene, validation, 2000).diagonal
+    validation, rng = validation_rays_of(scene, 1000), np.random.default_rng(0)
+    h = estimate_curvature(scene, validation, 1000).diagonal
     renderer = SceneRenderer(scene)
     codes = renderer.codes(validation.appearances)
     before = renderer.rgb(*validation.rays, codes)
@@ -74,8 +74,8 @@ def test_the_correlation_predicts_the_effect_of_errors_in_two_channels(
     scene = KINDS[kind](tiny_scene(3))
     monkeypatch.setattr(module, "RAYS_PER_GRADIENT", 16)
     monkeypatch.setattr(module, "BLOCK_SIDE", 1)
-    validation, rng = validation_rays_of(scene, 2000), np.random.default_rng(0)
-    found = estimate_curvature(scene, validation, 2000)
+    validation, rng = validation_rays_of(scene, 1000), np.random.default_rng(0)
+    found = estimate_curvature(scene, validation, 1000)
     before = SceneRenderer(scene).rgb(*validation.rays)
     for s, scale in enumerate(scene.scales):
         for name, plane in scale.items():

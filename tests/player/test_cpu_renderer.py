@@ -70,7 +70,7 @@ VIEWS = {
     + [(PlaneSampler, "contracted")],
 )
 def test_pictures_are_those_of_the_reference(kind: type, where: str, view: Camera) -> None:
-    """Through a grid, where that holds all there is."""
+    """Through a grid, where that holds all there is. Fog, which takes the most samples, is drawn at one time."""
     scene = tiny_scene(4, scales=1, channels=32)
     scene = linear_per_cell(view_independent(scene)) if kind is CornerGrid else scene
     if where in ("displaced", "contracted"):
@@ -81,7 +81,7 @@ def test_pictures_are_those_of_the_reference(kind: type, where: str, view: Camer
         weight = 0.02 * scene.decoder.density_weight
         scene = replace(scene, step=0.004, decoder=replace(scene.decoder, density_bias=0.0, density_weight=weight))
     renderer = renderer_of(scene, kind)
-    for time in (0.0, 0.6, 1.0):
+    for time in (0.6,) if where == "fog" else (0.0, 0.6, 1.0):
         got, wanted = renderer.render(view, time), render(scene, view, time)
         off = np.abs(got.rgb - wanted.rgb).max(axis=2)
         assert np.mean(off <= 1 / 255) > 0.998 and np.mean(np.abs(got.opacity - wanted.opacity) <= 1 / 255) > 0.998
