@@ -14,6 +14,7 @@ from kpc.player.cpu import reference
 from kpc.tools.cli import kprender
 from kpc.tools.rendering import content
 from kpc.tools.rendering.options import parser
+from kpc.tools.rendering.resuming import RECORD
 from kpc.tools.rendering.shots import shots_of
 from scenes import tiny_scene
 
@@ -57,7 +58,7 @@ def test_time_is_continuous(
     """Frame n is at n / fps seconds and keeps its number as its name, whichever are rendered."""
     code, _, complaint = run(scene_file, *words, *SIZE, "-o", tmp_path / "out")
     assert code == 0, complaint
-    assert sorted(p.stem for p in (tmp_path / "out").iterdir()) == [f"{number:04d}" for number in numbers]
+    assert sorted(p.stem for p in (tmp_path / "out").glob("*.png")) == [f"{number:04d}" for number in numbers]
     last = 7 if "--orbit" in words else fps
     assert times == pytest.approx([min(number / last, 1.0) for number in numbers])
 
@@ -191,6 +192,26 @@ def test_resuming_skips_whole_pictures_of_this_size(
     assert run(*words[:-1], out, "--size", "12x9")[0] == 0 and len(times) == 6  # another size
 
 
+@pytest.mark.parametrize(
+    ("more", "named"),
+    [
+        (["--background", "white"], "--background"),
+        (["--static-only"], "what is shown"),
+        (["--samples", "2"], "--samples"),
+        (["--camera", "0"], "--camera"),
+    ],
+)
+def test_resuming_with_other_options_is_refused(
+    run: Run, scene_file: Path, tmp_path: Path, more: list[str], named: str
+) -> None:
+    words = [scene_file, *SIZE, "-o", tmp_path / "out"]
+    assert run(*words, "--frames", "0-0")[0] == 0
+    assert run(*words, "--frames", "0-1", "--resume")[0] == 0, "other frames are what --resume is for"
+    code, _, printed = run(*words, "--frames", "0-2", "--resume", *more)
+    assert code == 2 and f"another value of {named}" in printed
+    assert not (tmp_path / "out" / "0002.png").exists()
+
+
 def test_a_damaged_exr_is_rendered_anew_without_a_word_of_its_reader(
     scene_file: Path, tmp_path: Path, times: list[float], capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -218,7 +239,7 @@ def test_ctrl_c_leaves_whole_frames_only(
     monkeypatch.setattr(reference, "render", interrupt)
     code, _, complaint = run(scene_file, *SIZE, "-o", tmp_path / name)
     assert code == 130 and complaint.endswith("kprender: interrupted\n")
-    left = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file())
+    left = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file() and p.name != RECORD)
     assert left == ([f"out/{number:04d}.png" for number in range(4)] if name == "out" else [])
     for file in left:
         assert read_image(tmp_path / file).shape == (12, 16, 3)

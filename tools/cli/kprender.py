@@ -33,7 +33,7 @@ from kpc.format.common.films import FilmFormat, write_film
 from kpc.format.common.progress import progress
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Part, Rendering
-from kpc.tools.rendering import pictures
+from kpc.tools.rendering import pictures, resuming
 from kpc.tools.rendering.content import mean_picture, renderer_of
 from kpc.tools.rendering.options import MAX_SIDE, parser
 from kpc.tools.rendering.outputs import Output
@@ -177,6 +177,7 @@ def _write_pictures(
         _say(f"{options.cameras}: {renamed} pictures get other names, for theirs are taken or no plain file names")
     if output.is_folder:
         cli.make_folder(output.path)
+        resuming.begin(output.path, options)
     wanted = list(zip(shots.numbers, paths, strict=True))
     if options.resume:
         wanted = [

@@ -1,0 +1,61 @@
+"""What the pictures in a folder show, so that --resume does not mix pictures of different options."""
+
+import argparse
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kpc.format.common.cli import atomic_write
+from kpc.format.common.errors import UsageError
+
+RECORD = "kprender.json"
+# Options that do not change what a picture shows: they choose pictures, or concern other outputs. A picture of another
+# size or format is rendered anew, or is another file.
+FREE = {"output", "resume", "start_s", "end_s", "frames", "step", "format", "size", "codec", "crf", "bits"}
+# Options whose name on the command line differs from that of their value.
+NAMES = {"content": "what is shown", "part": "--diagnose", "scene": "the scene"}
+
+
+def begin(folder: Path, options: argparse.Namespace) -> None:
+    """Note in a folder what its pictures show, before the first one is rendered.
+
+    Raises:
+        UsageError: `--resume` is given, and pictures that are there were rendered with other options.
+    """
+    now = _described(options)
+    record = folder / RECORD
+    if options.resume and record.is_file():
+        try:
+            before = dict(json.loads(record.read_text()))
+        except (ValueError, TypeError) as error:
+            raise UsageError(f"--resume: {record} cannot be read; delete it, or render without --resume") from error
+        for name in now:
+            if before.get(name) != now[name]:
+                what = NAMES.get(name, "--" + name.replace("_", "-"))
+                raise UsageError(
+                    f"--resume: the pictures in {folder} were rendered with another value of {what} "
+                    f"({_shown(before.get(name))}, now {_shown(now[name])}); give the same, or another folder with -o"
+                )
+    with atomic_write(record) as temporary:
+        temporary.write_text(json.dumps(now, indent=1) + "\n")
+
+
+def _described(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the options that pictures depend on, as JSON values; files count by their content."""
+    found = {}
+    for name, value in sorted(vars(options).items()):
+        if name in FREE:
+            continue
+        if isinstance(value, np.ndarray):
+            value = [float(number) for number in value]
+        elif isinstance(value, str | Path) and Path(value).is_file():
+            value = f"{Path(value).name}, SHA-256 {hashlib.sha256(Path(value).read_bytes()).hexdigest()[:16]}"
+        found[name] = value if isinstance(value, int | float | list | None) else str(value)
+    return found
+
+
+def _shown(value: Any) -> str:
+    return "none" if value is None else str(value)
