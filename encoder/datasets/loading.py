@@ -34,6 +34,8 @@ ASSUMED_FPS = 30.0
 # Cameras whose positions differ by no more than this share of their coordinates are one, since poses are rounded; so
 # are those that differ by no more than the narrowest box of a .kpc file, 1 / NUMBER_LIMIT.
 STILL = 1e-6
+# The least side in pixels that --downscale may leave: less is a slip of the keyboard.
+MIN_SIDE = 4
 
 
 def load_dataset(
@@ -114,7 +116,8 @@ def _check(root: Path, capture: Capture, downscale: int) -> None:
             "one viewpoint; add cameras"
         )
     for view in capture.views:
-        if downscale < 1 or min(view.width, view.height) < downscale:
+        least = 1 if downscale == 1 else MIN_SIDE
+        if downscale < 1 or min(view.width, view.height) // downscale < least:
             raise DatasetError(
                 f"{view.file}: {view.width}x{view.height} cannot be downscaled by {downscale}; lower --downscale"
             )

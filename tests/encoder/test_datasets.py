@@ -390,6 +390,7 @@ def test_damaged_image(tmp_path: Path) -> None:
 def test_too_much_downscaling(tmp_path: Path) -> None:
     make.write_nerfstudio(tmp_path / "set", images=3)
     fails(tmp_path / "set", "cannot be downscaled by 25", downscale=25)
+    fails(tmp_path / "set", "cannot be downscaled by 12", downscale=12)  # to pictures of a pixel or two
     fails(tmp_path / "set", "cannot be downscaled by 0", downscale=0)
 
 
