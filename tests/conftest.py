@@ -34,6 +34,20 @@ def quick_coding(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def searched() -> None:
+    """Search for symbols of least cost in spite of `rounded`."""
+
+
+@pytest.fixture
+def rounded(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Round to symbols instead of searching for them, which takes half of the time, where a test has not `searched`."""
+    import quick_coding
+
+    if "searched" not in request.fixturenames:
+        monkeypatch.setattr("kpc.encoder.rdo.codec_model.quantise_by_cost", quick_coding.rounded)
+
+
+@pytest.fixture
 def heeded_signals() -> Iterator[None]:
     """Restore the default of Ctrl-C, which the parent of these tests may ignore: kpenc leaves ignored signals alone."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)

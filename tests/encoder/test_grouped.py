@@ -39,7 +39,7 @@ from kpc.tools.bench import group_joins
 from kpc.tools.cli import kpjoin
 from training_runs import TINY
 
-pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding", "tiny")
+pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding", "rounded", "tiny")
 FRAMES = 26
 
 
@@ -225,6 +225,7 @@ def test_an_interrupted_run_resumes_in_its_group_to_the_same_file(videos, tmp_pa
     assert output.read_bytes() == (tmp_path / "whole.kpc").read_bytes()
 
 
+@pytest.mark.usefixtures("searched")
 def test_a_clip_is_coded_anew_group_by_group(videos, tmp_path, capsys):
     assert encode(videos, tmp_path / "long.kpc", "--steps", "8") == 0
     capsys.readouterr()

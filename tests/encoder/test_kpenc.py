@@ -26,13 +26,10 @@ from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.datasets import pixel_cache
 from kpc.encoder.evaluation.preview import Preview
 from kpc.encoder.field.config import PRESETS
-from kpc.encoder.rdo import codec_model
-from kpc.encoder.rdo.curvature import PerPlane
 from kpc.encoder.training.train import Trainer
-from kpc.format.coding.quantise import QuantisedScene, quantise_scene
 from kpc.format.common import cli
 from kpc.format.container import scene_io
-from kpc.format.scene.scene import HybridDecoder, Scene
+from kpc.format.scene.scene import HybridDecoder
 from kpc.format.scene.space import DeviceCoordinates
 from training_runs import TINY
 
@@ -42,22 +39,6 @@ pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding", "rounded", "t
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PRESETS, "draft", TINY)
-
-
-@pytest.fixture
-def searched() -> None:
-    """Search for symbols of least cost."""
-
-
-@pytest.fixture
-def rounded(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    """Round to symbols instead of searching for them, which takes half of the time, where a test has not `searched`."""
-
-    def rounding(scene: Scene, steps: PerPlane, looked_up: np.ndarray, *_: object, **__: object) -> QuantisedScene:
-        return quantise_scene(scene, steps, reached=looked_up)
-
-    if "searched" not in request.fixturenames:
-        monkeypatch.setattr(codec_model, "quantise_by_cost", rounding)
 
 
 @pytest.fixture(scope="module")

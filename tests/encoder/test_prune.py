@@ -32,9 +32,12 @@ SPARE = 0.05
 
 @pytest.fixture(autouse=True)
 def whole_searches(quick_coding: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Search until the target is met, which these tests check."""
+    """Search until the target is met, which these tests check, with enough rays for that."""
     monkeypatch.setattr("kpc.encoder.rdo.rate_search.MAX_ATTEMPTS", 16)
     monkeypatch.setattr("kpc.encoder.rdo.codec_model.TOLERANCE", 0.02)
+    monkeypatch.setattr("kpc.encoder.rdo.curvature.RAYS", 1 << 13)
+    for name in ("RAYS", "FEWER_RAYS"):
+        monkeypatch.setattr(f"kpc.encoder.rdo.occupancy_rdo.{name}", 1 << 18)
 
 
 Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
