@@ -99,12 +99,13 @@ def encode_with_weights(
     weights: np.ndarray, symbols: np.ndarray, coded: np.ndarray, quantiser: int, implied: np.ndarray | None = None
 ) -> bytes | None:
     """Encode a segment with given (C, WEIGHT_COUNT) int8 weights; None if the symbols do not follow the quantiser."""
-    followed, coded = np.array(symbols, order="C"), np.array(coded, order="C")
+    # Kernels are compiled for this layout, and anew for arrays that are read-only.
+    followed, coded, weights = (np.array(one, order="C") for one in (symbols, coded, weights))
     trace = np.empty(coded.size + int(coded.sum()) * symbols.shape[2] * MAX_DECISIONS, np.int16)
     position, mode = 0, map_mode(coded, implied)
     if mode == MAP_CODED:
         _, position = code_map(coded, 0, position, None, trace)
-    _, position, fits = code_symbols(followed, coded, quantiser, weights, 0, position, None, trace, None)
+    _, position, fits = code_symbols(followed, coded, quantiser, weights, 0, position, None, trace, new_neighbours(0))
     if not fits or not np.array_equal(followed, symbols):
         return None
     head = bytes([len(weights), mode | quantiser << MODE_BITS])
@@ -121,9 +122,14 @@ def collect_neighbours(symbols: np.ndarray, coded: np.ndarray) -> np.ndarray:
     the mean of w and n.
     """
     values = int(coded.sum()) * symbols.shape[2]
-    trace, neighbours = np.empty(values * MAX_DECISIONS, np.int16), np.empty((values, 2 + WEIGHT_COUNT), np.int16)
+    trace, neighbours = np.empty(values * MAX_DECISIONS, np.int16), new_neighbours(values)
     code_symbols(symbols, coded, SCALAR, np.zeros((1, WEIGHT_COUNT), np.int8), 0, 0, None, trace, neighbours)
     return neighbours
+
+
+def new_neighbours(count: int) -> np.ndarray:
+    """Return room for what `collect_neighbours` returns of `count` symbols; with 0 `code_symbols` collects nothing."""
+    return np.empty((count, 2 + WEIGHT_COUNT), np.int16)
 
 
 def fit_weights(neighbours: np.ndarray, count: int) -> np.ndarray:
@@ -229,7 +235,7 @@ def code_symbols(symbols, coded, quantiser, weights, state, position, words, tra
     Args:
         quantiser: SCALAR, TRELLIS or DEPENDENT.
         weights: (C, WEIGHT_COUNT) int8, in 1/64.
-        neighbours: None, or the result of `collect_neighbours` to be filled.
+        neighbours: of `new_neighbours`, to be filled as far as it reaches.
     """
     H, W, M = symbols.shape
     sets = tap_weights(weights)
@@ -280,7 +286,7 @@ def code_symbols(symbols, coded, quantiser, weights, state, position, words, tra
                     return state, position, False
                 symbols[y, x, m] = value
                 trellis = next_trellis_state(trellis, value, residual, local)
-                if neighbours is not None:
+                if collected < len(neighbours):
                     collect(neighbours[collected], value, gradient, w, ww, v1, v2, X)
                     collected += 1
                 ww, rww = w, rw

@@ -121,9 +121,9 @@ def test_dependent_offsets_in_odd_states_are_odd_or_zero(monkeypatch, flat):
     kernel = FunctionType(module.code_symbols.py_func.__code__, vars(module), "code_symbols")
     monkeypatch.setattr(module, "code_symbols", njit(kernel))
     v = np.random.default_rng(5).integers(-40, 40, (9, 30, 2)).astype(np.int8)
-    trace = np.empty(v.size * module.MAX_DECISIONS, np.int16)
+    trace, nothing = np.empty(v.size * module.MAX_DECISIONS, np.int16), module.new_neighbours(0)
     module.code_symbols(
-        v, np.ones((9, 30), bool), DEPENDENT, np.zeros((1, WEIGHT_COUNT), np.int8), 0, 0, None, trace, None
+        v, np.ones((9, 30), bool), DEPENDENT, np.zeros((1, WEIGHT_COUNT), np.int8), 0, 0, None, trace, nothing
     )
     assert follows_trellis(v, np.ones((9, 30), bool)) == (flat == 0)
     odd_ones, v = 0, v.astype(int)

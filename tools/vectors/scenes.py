@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from kpc.encoder.coding import motion_codec
-from kpc.encoder.coding.predictive import MAX_DECISIONS, code_symbols, trellis_transition
+from kpc.encoder.coding.predictive import MAX_DECISIONS, code_symbols, new_neighbours, trellis_transition
 from kpc.encoder.coding.rans import code_signed, encode_trace, new_models
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels
 from kpc.format.container.segments import DEPENDENT, MODE_BITS, PredictionWeights
@@ -182,7 +182,8 @@ def walked(symbols: np.ndarray, coded: np.ndarray, weights: np.ndarray, quantise
     bits.
     """
     trace = np.empty(symbols.size * MAX_DECISIONS, np.int16)
-    _, position, _ = code_symbols(symbols, np.ascontiguousarray(coded), quantiser, weights, 0, 0, None, trace, None)
+    coded, nothing = np.ascontiguousarray(coded), new_neighbours(0)
+    _, position, _ = code_symbols(symbols, coded, quantiser, weights, 0, 0, None, trace, nothing)
     return bytes([len(weights), quantiser << MODE_BITS]) + weights.tobytes() + encode_trace(trace[:position])
 
 
