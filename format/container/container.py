@@ -290,6 +290,7 @@ class Reader:
     name: str
     header: Header
     index: tuple[Entry, ...]
+    _reading: threading.Lock
 
     def __init__(self, source: "AnySource | Reader", *, allow_partial: bool = False):
         if isinstance(source, Reader):
