@@ -115,7 +115,7 @@ def results(address: str) -> dict[str, Any]:
     if reason is not None:
         pytest.skip(reason)
     SCREENSHOTS.mkdir(parents=True, exist_ok=True)
-    command = ["node", SCRIPT, address, str(web_page.browser()), SCREENSHOTS]
+    command: list[str | Path] = ["node", SCRIPT, address, str(web_page.browser()), SCREENSHOTS]
     done = subprocess.run(command, capture_output=True, cwd=web_page.WEB, text=True, timeout=TIMEOUT_S)
     assert done.returncode == 0, done.stderr[-4000:]
     return dict(json.loads(done.stdout.splitlines()[-1]))
