@@ -169,7 +169,7 @@ scenario('reflects attributes and properties', async () => {
   });
   assert.match(got.html, /controls="" loop="" autoplay="" playsinline="" poster="a.jpg" preload="none" quality="fine"/);
   assert.match(got.html, /target-fps="50" part="static" memory="100000000"/);
-  assert.deepEqual(got.now, ['auto', 30, 'none', true, 0.5, 'static', true]);
+  assert.deepEqual(got.now, ['auto', 0, 'none', true, 0.5, 'static', true]);
   assert.deepEqual(got.fresh, [Number.NaN, 0, 0, true, 0, null, '']);
   assert.deepEqual(await events(page), ['volumechange', 'volumechange']);
   await close(page);

@@ -18,7 +18,6 @@ const PROPERTIES = [
   ...['src', 'srcObject', 'poster', 'controls', 'autoplay', 'loop', 'muted', 'playsInline', 'preload', 'currentTime'],
   ...['playbackRate', 'volume', 'camera', 'cameraControls', 'quality', 'targetFps', 'appearance', 'memory'],
 ];
-const TARGET_FPS = 30;
 /** Milliseconds between two `progress` events, and after which it is found out anew whether the page scrolls. */
 const [PROGRESS_MS, PAGE_MS] = [350, 1000];
 const HAVE_FUTURE_DATA = 3;
@@ -138,7 +137,7 @@ export class KpcPlayer extends Base implements Model {
     if (name === 'poster') this.#ui.setPoster(this.poster);
     if (name === 'loop') this.#clock.loop = this.loop;
     if (name === 'camera' && value !== null) this.camera = value;
-    if (name === 'target-fps' && this.#session) this.#session.fps = this.targetFps;
+    if (name === 'target-fps' && this.#session) this.#session.fps = this.targetFps || undefined;
     if (name === 'autoplay' && this.autoplay && this.#session?.clip) this.#playByItself();
     this.#refresh();
   }
@@ -229,8 +228,9 @@ export class KpcPlayer extends Base implements Model {
     set(this, 'quality', value);
   }
 
+  /** Frames a second that `quality="auto"` holds; 0 for what suits the device. */
   get targetFps(): number {
-    return positive(this, 'target-fps', TARGET_FPS);
+    return positive(this, 'target-fps', 0);
   }
 
   set targetFps(value: number) {
@@ -477,7 +477,7 @@ export class KpcPlayer extends Base implements Model {
     this.#clock.loop = this.loop;
     const session = new Session(
       {
-        ...{ src, memory: this.memory, fps: this.targetFps, clock: this.#clock, stage: this.#ui.stage },
+        ...{ src, memory: this.memory, fps: this.targetFps || undefined, clock: this.#clock, stage: this.#ui.stage },
         workerUrl: this.getAttribute('worker-url'),
         shown: () => ({
           level: this.quality,

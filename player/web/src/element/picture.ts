@@ -9,7 +9,8 @@ import type { Clip } from '../streaming/clip.js';
 import type { SceneStream } from '../streaming/scene_stream.js';
 
 export interface PictureOptions {
-  fps: number;
+  /** Frames a second that level `auto` holds; undefined for what suits the device. */
+  fps: number | undefined;
   onLost(): void;
   onRestored(): void;
 }
@@ -36,8 +37,8 @@ export class Picture {
     return this.#renderer.isLost;
   }
 
-  set fps(fps: number) {
-    this.#renderer.pace.secondsPerFrame = 1 / fps;
+  set fps(fps: number | undefined) {
+    this.#renderer.pace.secondsPerFrame = 1 / (fps ?? this.#renderer.usualFps);
   }
 
   /** Set the size in pixels of the screen. */

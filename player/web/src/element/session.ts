@@ -19,7 +19,7 @@ export interface SessionOptions {
   src: string | Blob;
   memory: number;
   workerUrl: string | null;
-  fps: number;
+  fps: number | undefined;
   clock: Clock;
   /** Where the picture goes. */
   stage: HTMLElement;
@@ -130,7 +130,7 @@ export class Session {
     return this.#isSharp;
   }
 
-  set fps(fps: number) {
+  set fps(fps: number | undefined) {
     if (this.#picture) this.#picture.fps = fps;
   }
 

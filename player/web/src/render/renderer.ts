@@ -41,7 +41,7 @@ export interface DrawnPicture {
 }
 
 export interface RendererOptions {
-  /** Frames a second that `auto` holds. */
+  /** Frames a second that `auto` holds; `usualFps` if it is not given. */
   fps?: number;
   onLost?: () => void;
   onRestored?: () => void;
@@ -96,8 +96,7 @@ export class Renderer {
     this.#device = new Device(this.gl, options);
     this.#presentation = new Presentation(this.#device);
     this.#timer = new Timer(this.gl, this.isSoftware);
-    const fps = options.fps ?? (this.isSoftware ? FPS.processor : FPS.card);
-    this.pace = new Pace(1 / fps, this.isSoftware ? 0 : FIRST_RAYS);
+    this.pace = new Pace(1 / (options.fps ?? this.usualFps), this.isSoftware ? 0 : FIRST_RAYS);
     this.#secondsPerRay = this.isSoftware ? ASSUMED_SECONDS.processor : ASSUMED_SECONDS.card;
     this.gl.canvas.addEventListener('webglcontextlost', this.#onLost);
     this.gl.canvas.addEventListener('webglcontextrestored', this.#onRestored);
@@ -111,6 +110,11 @@ export class Renderer {
   /** Whether a processor stands in for a graphics card. */
   get isSoftware(): boolean {
     return this.#device.isSoftware;
+  }
+
+  /** Frames a second that `auto` holds unless others are asked for: a processor's would be too coarse at a card's. */
+  get usualFps(): number {
+    return this.isSoftware ? FPS.processor : FPS.card;
   }
 
   /** Whether the browser has taken the card away; it gives it back by itself, and the renderer goes on then. */
