@@ -135,7 +135,7 @@ def test_groups_hold_their_own_samples_and_go_on_without_a_click():
     assert sound_of_span(None, spans[0], fps) is None
 
 
-@pytest.mark.usefixtures("one_thread", "quick_coding", "heeded_signals")
+@pytest.mark.usefixtures("one_thread", "quick_coding", "rounded", "heeded_signals")
 def test_a_group_and_its_checkpoint_hold_the_sound_of_their_frames(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(PRESETS, "draft", TINY)
     out, kept = tmp_path / "out.kpc", tmp_path / "kept.kpck"
