@@ -212,6 +212,13 @@ def test_resuming_with_other_options_is_refused(
     assert not (tmp_path / "out" / "0002.png").exists()
 
 
+def test_resuming_tells_black_from_transparent(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    words = [scene_file, *SIZE, "--frames", "0-0", "--resume", "-o", tmp_path / "out"]
+    assert run(*words, "--background", "black")[0] == 0
+    code, _, printed = run(*words, "--background", "transparent")
+    assert code == 2 and "([0.0, 0.0, 0.0], now transparent)" in printed
+
+
 def test_a_damaged_exr_is_rendered_anew_without_a_word_of_its_reader(
     scene_file: Path, tmp_path: Path, times: list[float], capfd: pytest.CaptureFixture[str]
 ) -> None:

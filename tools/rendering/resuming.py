@@ -19,13 +19,20 @@ FREE = {"output", "resume", "start_s", "end_s", "frames", "step", "format", "siz
 NAMES = {"content": "what is shown", "part": "--diagnose", "scene": "the scene"}
 
 
-def begin(folder: Path, options: argparse.Namespace) -> None:
+def begin(folder: Path, options: argparse.Namespace, is_transparent: bool) -> None:
     """Note in a folder what its pictures show, before the first one is rendered.
+
+    Args:
+        folder: the folder of the pictures.
+        options: the options of `kprender`.
+        is_transparent: whether the pictures have alpha; the background of `options` is black then.
 
     Raises:
         UsageError: `--resume` is given, and pictures that are there were rendered with other options.
     """
     now = _described(options)
+    if is_transparent:
+        now["background"] = "transparent"
     record = folder / RECORD
     if options.resume and record.is_file():
         try:
