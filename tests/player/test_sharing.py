@@ -144,7 +144,7 @@ def test_what_cannot_be_shared_is_refused(
 def test_what_is_no_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.kpc").write_bytes(b"no scene")
     assert kpshare.main([str(tmp_path / "a.kpc"), "-o", str(tmp_path / "site")]) == 1
-    assert capsys.readouterr().err.count("\n") == 1
+    assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "site").exists()
 
 
 def read(url: str, **headers: str) -> tuple[bytes, dict[str, str]]:

@@ -94,6 +94,12 @@ def test_a_saved_view_opens_the_scene(folder):
     assert opening.time == 0.25 and opening.camera.camera_to_world == pytest.approx(camera.camera_to_world, abs=1e-5)
 
 
+def test_up_and_unit_hold_where_the_scene_is_put(folder):
+    placed = edit(folder, "--turn", "x:-90", "--scale", "0.5", "--up", "0,1,0", "--metres-per-unit", "2")
+    assert read(placed).metadata.document["up"] == pytest.approx([0, 1, 0])
+    assert read(placed).metadata.document["metres_per_unit"] == pytest.approx(2)
+
+
 @pytest.mark.parametrize(
     "options, code, words",
     [

@@ -52,7 +52,7 @@ def _command(argv: list[str]) -> None:
     edits, groups = _edits_from(options), Groups(options.scene)
     if edits.speed is not None and has_sound(groups):
         print("kpedit: the sound is left out, since it belongs to the speed of the source", file=sys.stderr)
-    metadata = _edited_metadata(groups.metadata(), options)
+    metadata = _edited_metadata(groups.metadata(), options, edits.placement)
     if not edits.any:
         size, kept_s = save(with_metadata(options.scene, metadata), options.output), None
     else:
@@ -71,8 +71,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--open-at", type=Path, metavar="JSON", help="open with the first view of a saved camera path or camera file"
     )
-    parser.add_argument("--up", type=_direction, metavar="X,Y,Z", help="which direction is up in the world")
-    parser.add_argument("--metres-per-unit", type=_length, metavar="M", help="length of a unit of the world")
+    parser.add_argument("--up", type=_direction, metavar="X,Y,Z", help="which direction is up in the new file")
+    parser.add_argument("--metres-per-unit", type=_length, metavar="M", help="length of a unit in the new file")
     parser.add_argument(
         "--transparent",
         action=argparse.BooleanOptionalAction,
@@ -156,13 +156,17 @@ def _history(options: argparse.Namespace) -> list[str]:
     return [f"edited by kpc {VERSION}: {', '.join(words)}"[:256]] if words else []
 
 
-def _edited_metadata(metadata: Metadata, options: argparse.Namespace) -> Metadata:
-    """Return the metadata as the options ask."""
+def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement: Placement | None) -> Metadata:
+    """Return the metadata as the options ask, before the scene is placed.
+
+    `--up` and `--metres-per-unit` are meant for the scene where it is put, so they are taken back from there.
+    """
     members: dict[str, Any] = {name: text or None for name, text in members_from(options).items()}
     if options.up is not None:
-        members["up"] = list(options.up)
+        up = np.array(options.up, float)
+        members["up"] = (up if placement is None else up @ placement.turn).tolist()
     if options.metres_per_unit is not None:
-        members["metres_per_unit"] = options.metres_per_unit
+        members["metres_per_unit"] = options.metres_per_unit * (1.0 if placement is None else placement.factor)
     if options.transparent is not None:
         members["transparent"] = options.transparent or None
     metadata = metadata.with_members(**members)

@@ -43,6 +43,8 @@ def _command(argv: list[str]) -> None:
     folders = [folder / name if is_gallery else folder for name in names]
     for one in folders if is_gallery else ():
         site.check_folder(one)
+    for file in files:
+        kpc.load(file)  # nothing is written if one of them cannot be read
     folder.mkdir(parents=True, exist_ok=True)
     site.copy_player(folder)
     root = "../" if is_gallery else ""
