@@ -219,6 +219,30 @@ def test_resuming_tells_black_from_transparent(run: Run, scene_file: Path, tmp_p
     assert code == 2 and "([0.0, 0.0, 0.0], now transparent)" in printed
 
 
+def test_pictures_of_other_options_are_never_taken_for_finished(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    words = [scene_file, *SIZE, "-o", tmp_path / "out"]
+    assert run(*words, "--frames", "0-1", "--background", "white")[0] == 0
+    assert run(*words, "--frames", "1-1", "--background", "black")[0] == 0
+    code, _, printed = run(*words, "--frames", "0-1", "--background", "black", "--resume")
+    assert code == 2 and "another value of --background (various, now" in printed
+    assert run(*words, "--frames", "0-1", "--background", "black")[0] == 0
+    assert run(*words, "--frames", "0-2", "--background", "black", "--resume")[0] == 0
+
+
+def test_what_a_run_replaces_is_deleted_before(
+    run: Run, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [scene_file, *SIZE, "--frames", "0-1", "-o", tmp_path / "out"]
+    assert run(*words, "--background", "white")[0] == 0
+
+    def interrupt(*arguments: object, **options: object) -> object:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(reference, "render", interrupt)
+    assert run(*words, "--background", "black")[0] == 130
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [RECORD]
+
+
 def test_a_damaged_exr_is_rendered_anew_without_a_word_of_its_reader(
     scene_file: Path, tmp_path: Path, times: list[float], capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -177,7 +177,7 @@ def _write_pictures(
         _say(f"{options.cameras}: {renamed} pictures get other names, for theirs are taken or no plain file names")
     if output.is_folder:
         cli.make_folder(output.path)
-        resuming.begin(output.path, options, is_transparent)
+        resuming.begin(output.path, options, is_transparent, paths)
     wanted = list(zip(shots.numbers, paths, strict=True))
     if options.resume:
         wanted = [

@@ -3,6 +3,7 @@
 import argparse
 import hashlib
 import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +16,22 @@ RECORD = "kprender.json"
 # Options that do not change what a picture shows: they choose pictures, or concern other outputs. A picture of another
 # size or format is rendered anew, or is another file.
 FREE = {"output", "resume", "start_s", "end_s", "frames", "step", "format", "size", "codec", "crf", "bits"}
+PICTURES = {".png", ".jpg", ".jpeg", ".exr"}
 # Options whose name on the command line differs from that of their value.
 NAMES = {"content": "what is shown", "part": "--diagnose", "scene": "the scene"}
 
 
-def begin(folder: Path, options: argparse.Namespace, is_transparent: bool) -> None:
+def begin(folder: Path, options: argparse.Namespace, is_transparent: bool, paths: Collection[Path]) -> None:
     """Note in a folder what its pictures show, before the first one is rendered.
+
+    Without `--resume`, pictures of other options that are to be replaced are deleted first, so that a later `--resume`
+    does not take them for finished; where others stay, the folder is noted to hold pictures of various options.
 
     Args:
         folder: the folder of the pictures.
         options: the options of `kprender`.
         is_transparent: whether the pictures have alpha; the background of `options` is black then.
+        paths: of the pictures to render.
 
     Raises:
         UsageError: `--resume` is given, and pictures that are there were rendered with other options.
@@ -34,18 +40,26 @@ def begin(folder: Path, options: argparse.Namespace, is_transparent: bool) -> No
     if is_transparent:
         now["background"] = "transparent"
     record = folder / RECORD
-    if options.resume and record.is_file():
+    if record.is_file():
         try:
             before = dict(json.loads(record.read_text()))
         except (ValueError, TypeError) as error:
-            raise UsageError(f"--resume: {record} cannot be read; delete it, or render without --resume") from error
-        for name in now:
-            if before.get(name) != now[name]:
-                what = NAMES.get(name, "--" + name.replace("_", "-"))
-                raise UsageError(
-                    f"--resume: the pictures in {folder} were rendered with another value of {what} "
-                    f"({_shown(before.get(name))}, now {_shown(now[name])}); give the same, or another folder with -o"
-                )
+            if options.resume:
+                raise UsageError(f"--resume: {record} cannot be read; delete it, or render without --resume") from error
+            before = {}
+        changed = [name for name in now if before.get(name) != now[name]]
+        if changed and options.resume:
+            name = changed[0]
+            what = NAMES.get(name, "--" + name.replace("_", "-"))
+            raise UsageError(
+                f"--resume: the pictures in {folder} were rendered with another value of {what} "
+                f"({_shown(before.get(name))}, now {_shown(now[name])}); give the same, or another folder with -o"
+            )
+        if changed:
+            for path in paths:
+                path.unlink(missing_ok=True)
+            if any(path.suffix in PICTURES for path in folder.iterdir()):
+                now |= dict.fromkeys(changed, "various")
     with atomic_write(record) as temporary:
         temporary.write_text(json.dumps(now, indent=1) + "\n")
 
