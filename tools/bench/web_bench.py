@@ -38,7 +38,7 @@ FRAMES, PLAY_S, TIMEOUT_S = 5, 12, 3600
 # Runs calls in a browser of their own.
 Run = Callable[..., list[Any]]
 # A level, and the side of the raster over that which the level has.
-Rung = tuple[str, float]
+Setting = tuple[str, float]
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Drawing:
     is_timed: bool  # whether the processor's frame rate is measured, too
 
 
-def measure(job: Drawing) -> tuple[str, dict[Rung, Record]]:
+def measure(job: Drawing) -> tuple[str, dict[Setting, Record]]:
     """Return what draws, and what was measured for each level, what `auto` chooses on DEVICES and, if timed, for it."""
     scene = scene_io.read(job.scene).dequantise()
     camera = fit_camera(Rig.of(scene).cameras[0], *job.size)
@@ -65,27 +65,32 @@ def measure(job: Drawing) -> tuple[str, dict[Rung, Record]]:
     def values(*calls: web_page.Call) -> list[Any]:
         return [result["value"] for result in run(*calls)]
 
-    (rungs,) = values(("rungs", [job_of("auto")]))
-    named: dict[Rung, Any] = {(level, 1.0): level for level in LEVELS}
-    named |= {(rung["level"], rung["scale"]): {"level": rung["level"], "scale": rung["scale"]} for rung in rungs}
+    (settings,) = values(("settings", [job_of("auto")]))
+    named: dict[Setting, Any] = {(level, 1.0): level for level in LEVELS}
+    named |= {
+        (setting["level"], setting["scale"]): {"level": setting["level"], "scale": setting["scale"]}
+        for setting in settings
+    }
     counts = dict(zip(named, values(*(("counted", [job_of(level)]) for level in named.values())), strict=True))
-    found = {rung: _looked_up(counted, job.size, scene.is_dynamic) for rung, counted in counts.items()}
+    found = {setting: _looked_up(counted, job.size, scene.is_dynamic) for setting, counted in counts.items()}
     reference = web_page.picture_of(counts["reference", 1.0], camera)
 
-    ladder = [(rung["level"], rung["scale"]) for rung in rungs]
+    offered = [(setting["level"], setting["scale"]) for setting in settings]
     choices = [
-        ("chosen", [job_of("auto"), [found[rung]["look_ups"] / rate for rung in ladder], fps])
+        ("chosen", [job_of("auto"), [found[setting]["look_ups"] / rate for setting in offered], fps])
         for rate, fps in DEVICES.values()
     ]
-    chosen = dict(zip(DEVICES, (ladder[number] for number in values(*choices)), strict=True))
+    chosen = dict(zip(DEVICES, (offered[number] for number in values(*choices)), strict=True))
     shown = list(dict.fromkeys([*((level, 1.0) for level in LEVELS), *chosen.values()]))
-    resampled = [rung for rung in shown if counts[rung]["pixels"] is None]
-    pictures = dict(zip(resampled, values(*(("picture", [job_of(named[rung])]) for rung in resampled)), strict=True))
-    for rung in shown:
-        got = web_page.picture_of(pictures.get(rung, counts[rung]), camera)
-        devices = [name for name, other in chosen.items() if other == rung]
-        found[rung] |= {"psnr": float(psnr(got, reference)), "chosen_on": devices}
-    measured = {rung: found[rung] for rung in shown}
+    resampled = [setting for setting in shown if counts[setting]["pixels"] is None]
+    pictures = dict(
+        zip(resampled, values(*(("picture", [job_of(named[setting])]) for setting in resampled)), strict=True)
+    )
+    for setting in shown:
+        got = web_page.picture_of(pictures.get(setting, counts[setting]), camera)
+        devices = [name for name, other in chosen.items() if other == setting]
+        found[setting] |= {"psnr": float(psnr(got, reference)), "chosen_on": devices}
+    measured = {setting: found[setting] for setting in shown}
     (drawn,) = values(("picture", [job_of({"level": "fastest", "scale": 0.1})]))
     return drawn["name"], measured | (_timed(run, job_of, camera, reference, measured) if job.is_timed else {})
 
@@ -114,9 +119,9 @@ def _looked_up(counted: Record, size: tuple[int, int], is_dynamic: bool) -> Reco
 
 
 def _timed(
-    run: Run, job_of: Callable[..., Any], camera: Camera, reference: np.ndarray, measured: dict[Rung, Record]
-) -> dict[Rung, Record]:
-    """Time a processor's pictures of each rung, into `measured`; return what `auto` does."""
+    run: Run, job_of: Callable[..., Any], camera: Camera, reference: np.ndarray, measured: dict[Setting, Record]
+) -> dict[Setting, Record]:
+    """Time a processor's pictures of each setting, into `measured`; return what `auto` does."""
     ready = ("picture", [job_of("fastest")])
     for (level, scale), record in measured.items():
         times = [(COMPARED_TIME + number / 30) % 1 for number in range(1, 1 + FRAMES)]
@@ -125,12 +130,12 @@ def _timed(
         record["software_fps"] = 1e3 / float(np.median(took["value"]))
         record["cpu_ms"] = None if took["cpuSeconds"] is None else 1e3 * took["cpuSeconds"] / FRAMES
     played, still = run(("play", [job_of("auto"), PLAY_S]), ("picture", [job_of("auto")]))
-    rung = {key: played["value"][key] for key in ("level", "scale")}
-    (picture,) = run(("picture", [job_of(rung)]))
+    setting = {key: played["value"][key] for key in ("level", "scale")}
+    (picture,) = run(("picture", [job_of(setting)]))
     took = played["value"]["ms"]
     return {
-        ("auto", rung["scale"]): {
-            "raster": f"{rung['level']}, {rung['scale']:.2f}",
+        ("auto", setting["scale"]): {
+            "raster": f"{setting['level']}, {setting['scale']:.2f}",
             "software_fps": 1e3 / float(np.median(took[len(took) // 2 :])),
             "psnr": float(psnr(web_page.picture_of(picture["value"], camera), reference)),
             "psnr_still": float(psnr(web_page.picture_of(still["value"], camera), reference)),

@@ -27,7 +27,7 @@ export { loadCore } from './decoder/module.js';
 export { DecoderPool, type PoolOptions } from './decoder/pool.js';
 export { KpcPlayer, type PlayerRanges } from './element/kpc-player.js';
 export type { PlayerError, PlayerErrorCode } from './element/messages.js';
-export { RenderError } from './render/device.js';
+export { RenderError } from './render/context.js';
 export type { DrawnScene } from './render/drawn_scene.js';
 export type { Moment, ShownPart } from './render/picture_job.js';
 export { LEVEL_NAMES, type Level } from './render/quality.js';

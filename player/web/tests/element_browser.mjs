@@ -228,15 +228,16 @@ scenario('comes back to where the scene holds', async () => {
     it.camera = 'middle';
   });
   await inside(page, '.stage').focus();
-  await page.keyboard.down('d');
-  await page.waitForTimeout(700);
-  await page.keyboard.up('d');
-  const away = numbers(await player(page, (it) => it.camera));
-  await page.waitForTimeout(1500);
-  const back = numbers(await player(page, (it) => it.camera));
+  // The file holds 0.2902 around this point; a view that is moved further comes back once the key is up.
   const focus = [0.02, 0.1, 0.56];
-  const from = (view) => Math.hypot(...focus.map((x, i) => view[i + 3] - x));
-  assert.ok(from(back) < 0.2903 && from(away) > from(back), `${away} ${back}`);
+  const isWithin = (it, centre, radius) => {
+    const view = it.camera.split(' ').map(Number);
+    return Math.hypot(...centre.map((x, i) => view[i + 3] - x)) < radius;
+  };
+  await page.keyboard.down('d');
+  while (await player(page, isWithin, focus, 0.32)) await page.waitForTimeout(20);
+  await page.keyboard.up('d');
+  await until(page, isWithin, focus, 0.2903);
   await close(page);
 });
 
@@ -392,11 +393,12 @@ scenario('leaves nothing behind over 50 mounts', async () => {
     for (let mount = 0; mount < 50; mount++) {
       document.body.innerHTML = tag;
       const player = document.querySelector('kpc-player');
-      // Most are removed before they draw, some before they have opened the file.
+      // Most are removed before they draw, some before they have a context, some before they have opened the file.
       const event = mount % 25 === 24 ? 'canplay' : mount % 3 === 0 ? 'loadstart' : 'loadedmetadata';
       await (event === 'loadstart'
         ? new Promise((resolve) => setTimeout(resolve, 5))
         : new Promise((resolve) => player.addEventListener(event, resolve, { once: true })));
+      while (mount % 3 === 2 && !player.shadowRoot.querySelector('canvas')) await new Promise(requestAnimationFrame);
       player.remove();
       await new Promise((resolve) => setTimeout(resolve, 0));
     }
@@ -409,7 +411,7 @@ scenario('leaves nothing behind over 50 mounts', async () => {
       made: counts.contexts.length,
     };
   }, TAG);
-  assert.ok(value.made >= 30);
+  assert.ok(value.made >= 18);
   assert.deepEqual([value.workers, value.listeners, value.alive], [0, 0, 0]);
   await close(page);
 });

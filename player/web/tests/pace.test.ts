@@ -3,15 +3,15 @@
 import assert from 'node:assert/strict';
 import test from 'node:test';
 
-import { costOf, Pace, rungsOf } from '../src/render/pace.js';
+import { costOf, Pace, settingsOf } from '../src/render/pace.js';
 
 const FRAME = 1 / 30;
 
-/** Draw frames on a device that takes `fixed` seconds and `perRay` for each ray of a pixel; return all rungs' costs. */
+/** Draw frames on a device that takes `fixed` seconds and `perRay` for each ray of a pixel; return all settings' costs. */
 function play(pace: Pace, perRay: number, fixed: number, frames: number): number[] {
   return Array.from({ length: frames }, (_, i) => {
-    const rung = pace.rung(1);
-    const cost = costOf(rung, 1);
+    const setting = pace.setting(1);
+    const cost = costOf(setting, 1);
     pace.record(cost, (fixed + perRay * cost) * (i % 7 === 3 ? 1.3 : 1));
     return cost;
   });
@@ -22,9 +22,9 @@ for (const [speed, perRay] of [0.0005, 0.02, 0.1, 1, 5].entries()) {
     for (const fixed of [0, 0.004]) {
       const costs = play(new Pace(FRAME, 0.1), perRay, fixed, 600).slice(60);
       const cost = costs.sort((a, b) => a - b)[Math.floor(costs.length / 2)];
-      assert.ok(fixed + perRay * cost <= FRAME || cost === costOf(rungsOf(1)[0], 1));
-      const finer = rungsOf(1)
-        .map((rung) => costOf(rung, 1))
+      assert.ok(fixed + perRay * cost <= FRAME || cost === costOf(settingsOf(1)[0], 1));
+      const finer = settingsOf(1)
+        .map((setting) => costOf(setting, 1))
         .find((other) => other > cost);
       assert.ok(finer === undefined || fixed + perRay * finer > 0.4 * FRAME);
     }
@@ -50,9 +50,9 @@ test('where little depends on the rays, pictures do not become ever coarser', ()
   assert.ok(cost > 0.01);
 });
 
-test('rungs cost more and more', () => {
+test('settings cost more and more', () => {
   for (const texels of [0.05, 0.3, 1, 1.7, 2, 8, 100]) {
-    const costs = rungsOf(texels).map((rung) => costOf(rung, texels));
+    const costs = settingsOf(texels).map((setting) => costOf(setting, texels));
     assert.deepEqual(
       costs,
       [...costs].sort((a, b) => a - b),

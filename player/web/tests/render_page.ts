@@ -3,7 +3,7 @@
 import { Layout } from '../src/render/atlas.js';
 import { type Camera, texelsPerPixel } from '../src/render/camera.js';
 import type { DrawnScene } from '../src/render/drawn_scene.js';
-import { costOf, Pace, type Rung, rungsOf } from '../src/render/pace.js';
+import { costOf, Pace, type Setting, settingsOf } from '../src/render/pace.js';
 import type { Moment, ShownPart } from '../src/render/picture_job.js';
 import { LEVELS, type Level } from '../src/render/quality.js';
 import { type DrawnPicture, FIRST_RAYS, Renderer } from '../src/render/renderer.js';
@@ -18,7 +18,7 @@ interface Job {
   file: string;
   camera: Camera;
   time: number; // in [0, 1] of the clip
-  level: Level | Rung | 'auto';
+  level: Level | Setting | 'auto';
   part?: ShownPart;
   appearance?: string | null;
   halfFloat?: boolean;
@@ -125,21 +125,21 @@ const page = {
   },
 
   /** Return what `auto` chooses from. */
-  async rungs(job: Job): Promise<(Rung & { cost: number })[]> {
+  async settings(job: Job): Promise<(Setting & { cost: number })[]> {
     const texels = texelsPerPixel((await open(job)).clip.scenes[0], job.camera);
-    return rungsOf(texels).map((rung) => ({ ...rung, cost: costOf(rung, texels) }));
+    return settingsOf(texels).map((setting) => ({ ...setting, cost: costOf(setting, texels) }));
   },
 
-  /** Return which of the rungs `auto` chooses on a device that takes so many seconds for each. */
+  /** Return which of the settings `auto` chooses on a device that takes so many seconds for each. */
   async chosen(job: Job, seconds: number[], fps: number): Promise<number> {
     const texels = texelsPerPixel((await open(job)).clip.scenes[0], job.camera);
-    const names = rungsOf(texels).map((rung) => JSON.stringify(rung));
+    const names = settingsOf(texels).map((setting) => JSON.stringify(setting));
     const pace = new Pace(1 / fps, FIRST_RAYS);
     for (let i = 0; i < CHOOSING_FRAMES; i++) {
-      const rung = pace.rung(texels);
-      pace.record(costOf(rung, texels), seconds[names.indexOf(JSON.stringify(rung))]);
+      const setting = pace.setting(texels);
+      pace.record(costOf(setting, texels), seconds[names.indexOf(JSON.stringify(setting))]);
     }
-    return names.indexOf(JSON.stringify(pace.rung(texels)));
+    return names.indexOf(JSON.stringify(pace.setting(texels)));
   },
 
   /** Play for some seconds as fast as it goes; return the milliseconds between pictures, and what was drawn last. */

@@ -13,6 +13,7 @@ import type {
   PlaneHead,
   SceneHead,
 } from '../container/scene_chunks.js';
+import { loadDriver } from '../render/context.js';
 import type { Core } from './core.js';
 import { decodeSegment, type Projection } from './segment.js';
 import { layerTexels } from './texels.js';
@@ -64,14 +65,21 @@ export interface SegmentTask {
   asTexels: boolean;
 }
 
-export type Task = SceneTask | MetadataTask | ProjectTask | SegmentTask;
+/** Load the driver of the graphics card. */
+export interface DriverTask {
+  kind: 'driver';
+}
+
+export type Task = SceneTask | MetadataTask | ProjectTask | SegmentTask | DriverTask;
 export type Result<T extends Task> = T extends SceneTask
   ? SceneContent
   : T extends MetadataTask
     ? Metadata
     : T extends ProjectTask
       ? Projection
-      : Int8Array<ArrayBuffer> | Uint16Array<ArrayBuffer>;
+      : T extends DriverTask
+        ? undefined
+        : Int8Array<ArrayBuffer> | Uint16Array<ArrayBuffer>;
 
 /** Do a task; return its result, and the buffers of it that are moved to the page instead of being copied. */
 export function perform(core: Core, task: Task): { result: Result<Task>; moved: ArrayBuffer[] } {
@@ -82,6 +90,9 @@ export function perform(core: Core, task: Task): { result: Result<Task>; moved: 
       const chunk = new Chunk(task.number, task.entry, task.body);
       return { result: parseMetadata(chunk.content(META_LIMIT)), moved: [] };
     }
+    case 'driver':
+      loadDriver();
+      return { result: undefined, moved: [] };
     case 'project': {
       const [rows, columns] = task.cells;
       const projected = core.project(task.content, task.plane, rows * columns);

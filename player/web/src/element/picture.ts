@@ -2,7 +2,7 @@
 
 import type { Camera } from '../container/scene_chunks.js';
 import type { DrawnScene } from '../render/drawn_scene.js';
-import type { ShownPart } from '../render/picture_job.js';
+import type { Moment, ShownPart } from '../render/picture_job.js';
 import type { Level } from '../render/quality.js';
 import { Renderer } from '../render/renderer.js';
 import type { Clip } from '../streaming/clip.js';
@@ -27,9 +27,12 @@ export class Picture {
   readonly #renderer: Renderer;
   readonly #scenes = new Map<SceneStream, DrawnScene>();
 
-  /** @throws RenderError: the browser cannot draw. */
-  constructor(options: PictureOptions) {
-    this.canvas = document.createElement('canvas');
+  /**
+   * @param size width and height in pixels of the screen; to change it later waits for what the card does then.
+   * @throws RenderError: the browser cannot draw.
+   */
+  constructor([width, height]: readonly [number, number], options: PictureOptions) {
+    this.canvas = Object.assign(document.createElement('canvas'), { width, height });
     this.#renderer = new Renderer(this.canvas, options);
   }
 
@@ -61,10 +64,17 @@ export class Picture {
    * @returns how many pictures have been shown so far, and whether the last one will not become finer by itself.
    */
   draw(clip: Clip, time: number, camera: Camera, { level, part, appearance }: ShownOptions) {
-    const parts = clip.parts(time);
-    const moments = parts.map(({ scene, time, share }) => ({ scene: this.#drawn(scene), time, share }));
-    const found = parts[0].scene.appearances.find(({ name }) => name === appearance);
-    return this.#renderer.draw(camera, moments, { level, part, appearance: found?.embedding ?? null });
+    const found = clip.parts(time)[0].scene.appearances.find(({ name }) => name === appearance);
+    return this.#renderer.draw(camera, this.#moments(clip, time), {
+      level,
+      part,
+      appearance: found?.embedding ?? null,
+    });
+  }
+
+  /** Have shaders compiled for that, before there is anything to draw. */
+  prepare(clip: Clip, time: number, camera: Camera, { level, part }: ShownOptions): void {
+    this.#renderer.prepare(camera, this.#moments(clip, time), { level, part });
   }
 
   /** Forget a scene that the clip no longer holds. */
@@ -90,6 +100,10 @@ export class Picture {
     this.#renderer.dispose();
     this.#renderer.gl.getExtension('WEBGL_lose_context')?.loseContext();
     this.canvas.remove();
+  }
+
+  #moments(clip: Clip, time: number): Moment[] {
+    return clip.parts(time).map(({ scene, time, share }) => ({ scene: this.#drawn(scene), time, share }));
   }
 
   #drawn(scene: SceneStream): DrawnScene {

@@ -7,6 +7,7 @@ import { Rig } from './camera/rig.js';
 import { cameraOf, type View } from './camera/view.js';
 import { ViewControl } from './camera/view_control.js';
 import type { Clock } from './clock.js';
+import { loadDriver } from './driver.js';
 import type { Input } from './input.js';
 import { Picture, type ShownOptions } from './picture.js';
 
@@ -79,6 +80,7 @@ export class Session {
     const { src, memory, workerUrl, stage, fps } = this.#options;
     try {
       const pool = workerUrl === null ? {} : { workerUrl };
+      const driver = loadDriver(pool);
       const clip = await Clip.open(src, { memory, signal: this.#opening.signal, pool });
       if (this.#isClosed) return clip.close();
       this.clip = clip;
@@ -90,7 +92,11 @@ export class Session {
       clip.addEventListener('arrived', this.#arrived);
       clip.addEventListener('error', () => this.#failed(clip.error));
       clip.addEventListener('release', (event) => this.#picture?.release((event as SceneEvent).scene));
-      this.#picture = new Picture({
+      this.#events.opened();
+      this.wake();
+      await driver;
+      if (this.#isClosed) return;
+      this.#picture = new Picture(this.#size, {
         fps,
         onLost: () => this.#events.lost(true),
         onRestored: () => {
@@ -99,7 +105,6 @@ export class Session {
         },
       });
       stage.append(this.#picture.canvas);
-      this.#events.opened();
       this.wake();
     } catch (error) {
       if (!this.#isClosed) this.#failed(error);
@@ -203,13 +208,14 @@ export class Session {
     if (clip === null || view === null || this.#picture === null || width === 0 || height === 0) return;
     const { time, isSeeking } = this.#options.clock;
     const hasTaken = this.#picture.take(clip);
+    const camera = cameraOf(view.view, width, height);
     // Nothing that is worse than the poster, or than the picture before a jump.
     if (!this.#isInSight || !(clip.canShow(time) || (this.isShown && !isSeeking))) {
       this.#isSharp = !hasTaken;
+      this.#picture.prepare(clip, time, camera, this.#shownOptions());
       return;
     }
     this.#picture.resize(width, height);
-    const camera = cameraOf(view.view, width, height);
     const { pictures, isSharp } = this.#picture.draw(clip, time, camera, this.#shownOptions());
     this.pictures = pictures;
     this.#isSharp = isSharp;

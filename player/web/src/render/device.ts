@@ -1,17 +1,8 @@
 /** WebGL2: what it can do, and the objects made of it, which are counted so that nothing is left behind. */
 
-import { KpcError } from '../container/errors.js';
-import { fromHalf } from '../container/scene_chunks.js';
+import { fromHalves } from '../container/scene_chunks.js';
+import { RenderError } from './context.js';
 import { compose, type Defines, firstError, type Written } from './shader.js';
-
-/** This browser or card cannot draw a scene; the message says why, for people. */
-export class RenderError extends KpcError {
-  override name = 'RenderError';
-
-  constructor(message: string, code: 'no-webgl' | 'graphics' = 'graphics') {
-    super(message, code);
-  }
-}
 
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 
@@ -40,6 +31,8 @@ export interface Program {
 export interface Compilation {
   readonly handle: WebGLProgram;
   readonly stages: readonly { shader: WebGLShader; files: string[] }[];
+  /** Signalled once it is compiled, where the browser does not tell otherwise. */
+  readonly fence: WebGLSync | null;
 }
 
 const BYTES: Record<Format, number> = { rgba32f: 16, rgba16f: 8, rgba8: 4, rg32f: 8, rg16f: 4, r8ui: 1 };
@@ -61,6 +54,9 @@ export class Device {
   readonly planeFormat: 'rgba16f' | 'rgba32f';
   #objects = 0;
   readonly #vertices: WebGLVertexArrayObject;
+  /** Whether a program has been taken in this frame: each waits a little for the card. */
+  hasTaken = false;
+  readonly #compiling = new Set<Compilation>();
   readonly #parallel: KHR_parallel_shader_compile | null;
 
   constructor(
@@ -118,7 +114,7 @@ export class Device {
     const [, layout] = this.#formats(texture.format);
     // WebGL does not turn halves into float32 by itself.
     const isWidened = given instanceof Uint16Array && texture.format === 'rgba32f';
-    const values = isWidened ? Float32Array.from(given, fromHalf) : given;
+    const values = isWidened ? fromHalves(given) : given;
     const isHalf = values instanceof Uint16Array;
     const type = isHalf ? gl.HALF_FLOAT : values instanceof Uint8Array ? gl.UNSIGNED_BYTE : gl.FLOAT;
     this.#resetUnpacking();
@@ -164,26 +160,61 @@ export class Device {
       return { shader, files };
     });
     gl.linkProgram(handle);
-    return { handle, stages };
+    if (!this.#parallel) gl.validateProgram(handle); // has the card link now, not when the result is asked for
+    const fence = this.#parallel ? null : gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    const compilation = { handle, stages, fence };
+    this.#compiling.add(compilation);
+    return compilation;
   }
 
-  /** Whether a program is compiled, so that `program` does not wait; true where the browser does not tell. */
-  isCompiled({ handle }: Compilation): boolean {
-    return this.#parallel === null || this.gl.getProgramParameter(handle, this.#parallel.COMPLETION_STATUS_KHR);
+  /** Whether programs are being compiled; as long as they are, `program` would wait, whichever is asked for. */
+  get isCompiling(): boolean {
+    for (const compilation of this.#compiling) {
+      if (!this.#isCompiled(compilation)) return true;
+      this.#compiling.delete(compilation);
+    }
+    return false;
   }
 
   /** Return what has been compiled; wait for it if necessary. */
-  program({ handle, stages }: Compilation): Program {
+  program(compilation: Compilation): Program {
     const { gl } = this;
+    const { handle, stages, fence } = compilation;
+    gl.deleteSync(fence);
+    this.#compiling.delete(compilation);
     const isLinked = gl.getProgramParameter(handle, gl.LINK_STATUS) || gl.isContextLost();
-    const failed = stages.find(({ shader }) => !gl.getShaderParameter(shader, gl.COMPILE_STATUS)) ?? stages[1];
-    const log = isLinked ? '' : gl.getShaderInfoLog(failed.shader) || gl.getProgramInfoLog(handle) || 'does not link';
+    const error = isLinked ? null : this.#errorOf(compilation);
     for (const { shader } of stages) gl.deleteShader(shader);
-    if (!isLinked) {
+    if (error !== null) {
       this.release({ handle, uniforms: new Map() });
-      throw new RenderError(`${firstError(log, failed.files)} (driver: ${this.name}); update it`);
+      throw error;
     }
     return { handle, uniforms: this.#uniforms(handle) };
+  }
+
+  /** Delete a program that is being compiled. */
+  abandon(compilation: Compilation): void {
+    const { gl } = this;
+    const { handle, stages, fence } = compilation;
+    gl.deleteSync(fence);
+    this.#compiling.delete(compilation);
+    for (const { shader } of stages) gl.deleteShader(shader);
+    this.release({ handle, uniforms: new Map() });
+  }
+
+  #isCompiled({ handle, fence }: Compilation): boolean {
+    const { gl } = this;
+    if (this.#parallel) return gl.getProgramParameter(handle, this.#parallel.COMPLETION_STATUS_KHR);
+    return fence === null || gl.getSyncParameter(fence, gl.SYNC_STATUS) === gl.SIGNALED;
+  }
+
+  /** Return why a program does not link; each question waits for the card, so none is asked of one that does. */
+  #errorOf({ handle, stages }: Compilation): RenderError {
+    const { gl } = this;
+    const failed = stages.find(({ shader }) => !gl.getShaderParameter(shader, gl.COMPILE_STATUS)) ?? stages[1];
+    const log = gl.getShaderInfoLog(failed.shader) || gl.getProgramInfoLog(handle) || 'does not link';
+    return new RenderError(`${firstError(log, failed.files)} (driver: ${this.name}); update it`);
   }
 
   /** Set the uniforms that a program has: whole numbers and samplers by number, all else by the length of its array. */

@@ -18,8 +18,10 @@ export interface Shot {
   isCounted?: boolean; // whether look-ups of cells are counted, too
 }
 
-/** Texels that are uploaded before a frame, at most: a hundredth of a second on a slow telephone. */
-const BYTES_A_FRAME = 4 << 20;
+/** Texels that are uploaded at once, and before a frame at most: a hundredth of a second on a slow telephone. */
+const [BYTES_AT_ONCE, BYTES_A_FRAME] = [1 << 18, 4 << 20];
+/** Milliseconds of a frame after which the rest of the texels waits for the next one. */
+const UPLOAD_MS = 6;
 
 interface Parts {
   device: Device;
@@ -44,9 +46,12 @@ export class DrawnScene {
   /** Upload rows of planes that have arrived, as many as a frame has time for. */
   upload(device: Device): void {
     const { textures, folded } = this.#on(device);
-    for (const rows of this.source.take(BYTES_A_FRAME)) {
-      textures.put(rows);
-      folded?.planesChanged();
+    const due = performance.now() + UPLOAD_MS;
+    for (let bytes = 0; bytes < BYTES_A_FRAME; bytes += BYTES_AT_ONCE) {
+      const taken = [...this.source.take(BYTES_AT_ONCE)];
+      for (const rows of taken) textures.put(rows);
+      if (taken.length) folded?.planesChanged();
+      if (taken.length === 0 || performance.now() > due) break;
     }
   }
 

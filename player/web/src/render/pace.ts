@@ -2,8 +2,8 @@
 
 import { LEVELS, type Level } from './quality.js';
 
-/** A level, and the side of the raster over that of the picture, besides what the level itself takes off. */
-export interface Rung {
+/** A quality level and a scale: the side of the raster over that of the picture, besides what the level takes off. */
+export interface Setting {
   level: Level;
   scale: number;
 }
@@ -19,23 +19,23 @@ const COARSE_TEXELS = [1.7, 2];
 const MOST_TEXELS = 3.5;
 const LEAST_SIDE = 0.35;
 
-/** Return the rungs for pictures whose pixels span so many texels of the finest scale, from the fastest on. */
-export function rungsOf(texelsPerPixel: number): Rung[] {
+/** Return the settings for pictures whose pixels span so many texels of the finest scale, from the fastest on. */
+export function settingsOf(texelsPerPixel: number): Setting[] {
   const [least, most] = COARSE_TEXELS;
   const sides = SIDES.filter((side) => texelsPerPixel <= MOST_TEXELS * side || side >= LEAST_SIDE);
-  const rungs = (level: Level, chosen: number[]) =>
+  const settings = (level: Level, chosen: number[]) =>
     chosen.map((side) => ({ level, scale: side / LEVELS[level].resolution }));
   return [
-    ...rungs(
+    ...settings(
       'fastest',
       sides.filter((side) => texelsPerPixel >= least * side),
     ),
-    ...rungs(
+    ...settings(
       'faster',
       sides.filter((side) => side < 1 && texelsPerPixel <= most * side),
     ),
-    ...rungs('balanced', [1]),
-    ...rungs('fine', [1]),
+    ...settings('balanced', [1]),
+    ...settings('fine', [1]),
   ];
 }
 
@@ -47,7 +47,7 @@ const DOWN_AFTER = 3;
 const UP_AFTER = 8;
 // Frames for which the time of other costs, and what proved too slow, is remembered.
 const REMEMBERED = 300;
-// Share of the time of a frame below which the next finer rung is tried, whatever is expected of it, and its cost over
+// Share of the time of a frame below which the next finer setting is tried, whatever is expected of it, and its cost over
 // that of the one before.
 const ROOMY = 0.7;
 const NEXT_COST = 1.5;
@@ -55,14 +55,14 @@ const NEXT_COST = 1.5;
 const ORIGIN_WEIGHT = 0.5;
 
 /** Return the rays that are marched for each pixel that spans so many texels, those of longer steps counting less. */
-export function costOf({ level, scale }: Rung, texelsPerPixel: number): number {
+export function costOf({ level, scale }: Setting, texelsPerPixel: number): number {
   const { resolution, step, raysAcross } = LEVELS[level];
   const rays = Math.max(1, Math.min(Math.floor(texelsPerPixel), raysAcross));
   return (rays * resolution * scale) ** 2 / step;
 }
 
 /**
- * Chooses a rung by how long frames took: fixed + perRay cost seconds, fitted to the times of the costs that were tried,
+ * Chooses a setting by how long frames took: fixed + perRay cost seconds, fitted to the times of the costs that were tried,
  * as kpc.player.app.resolution_controller does. If the time of one of them changes, those of all do, by the same factor.
  */
 export class Pace {
@@ -82,10 +82,13 @@ export class Pace {
     this.#affordable = affordable;
   }
 
-  /** Return the finest rung for which there is time. */
-  rung(texelsPerPixel: number): Rung {
-    const [fastest, ...finer] = rungsOf(texelsPerPixel);
-    return finer.reduce((best, rung) => (this.#isAffordable(costOf(rung, texelsPerPixel)) ? rung : best), fastest);
+  /** Return the finest setting for which there is time. */
+  setting(texelsPerPixel: number): Setting {
+    const [fastest, ...finer] = settingsOf(texelsPerPixel);
+    return finer.reduce(
+      (best, setting) => (this.#isAffordable(costOf(setting, texelsPerPixel)) ? setting : best),
+      fastest,
+    );
   }
 
   /** Take the time of a picture, and how many rays were marched for each of its pixels. */

@@ -3,7 +3,7 @@
 import { type Camera, resized, texelsPerPixel } from './camera.js';
 import type { Device } from './device.js';
 import type { DrawnScene, Shot } from './drawn_scene.js';
-import type { Rung } from './pace.js';
+import type { Setting } from './pace.js';
 import type { Presentation, Target } from './presentation.js';
 import { LEVELS, type Quality } from './quality.js';
 import type { SceneSource } from './scene_source.js';
@@ -45,7 +45,7 @@ const MOST_PIXELS = 1 << 22;
 
 export class PictureJob {
   readonly view: View;
-  readonly rung: Rung;
+  readonly setting: Setting;
   readonly role: string;
   /** Seconds that the card has spent on it. */
   seconds = 0;
@@ -53,16 +53,16 @@ export class PictureJob {
   readonly #keeping: Keeping;
   #nextRow = 0;
 
-  constructor(view: View, rung: Rung, presentation: Presentation, keeping: Keeping) {
+  constructor(view: View, setting: Setting, presentation: Presentation, keeping: Keeping) {
     this.view = view;
-    this.rung = rung;
+    this.setting = setting;
     this.role = keeping.role;
     this.#keeping = keeping;
-    const quality = LEVELS[rung.level];
+    const quality = LEVELS[setting.level];
     const parts = { all: [true], static: [false], dynamic: [true, false] }[view.part];
     this.#shots = view.moments.flatMap(({ scene, time, share }, number) => {
       const raysAcross = raysAcrossOf(scene.source, view.camera, quality);
-      const camera = rasterOf(view.camera, raysAcross * quality.resolution * rung.scale);
+      const camera = rasterOf(view.camera, raysAcross * quality.resolution * setting.scale);
       const { appearance } = view;
       const background = view.background ?? scene.source.head.background;
       return parts.map((isMoving) => {

@@ -1,6 +1,10 @@
 /** Pictures on the card, and how they come to their size and to the screen. */
 
-import { type Device, type Framebuffer, type Program, RenderError, type Texture } from './device.js';
+import { CompiledPrograms } from './compiled.js';
+import { RenderError } from './context.js';
+import type { Compilation, Device, Framebuffer, Program, Texture } from './device.js';
+import type { Setting } from './pace.js';
+import { LEVELS } from './quality.js';
 import { UNIT } from './scene_textures.js';
 import type { Defines } from './shader.js';
 
@@ -25,15 +29,30 @@ export interface Target extends Framebuffer {
 /** What of pictures to show; the value is MODE of present.glsl. */
 export const SHOWN = { colour: 0, difference: 1 } as const;
 
+const modeOf = (isDifference: boolean): Defines => ({ MODE: isDifference ? SHOWN.difference : SHOWN.colour });
+
 // Targets that are kept for the next use of their size: a picture of two groups, the next one, and a still one.
 const TARGETS_KEPT = 8;
 
 export class Presentation {
-  readonly #programs = new Map<string, Program>();
+  readonly #compiled: CompiledPrograms;
   readonly #targets = new Map<string, Target>();
   #canvas: { shown: Texture; framebuffer: Framebuffer } | null = null;
 
-  constructor(readonly device: Device) {}
+  constructor(readonly device: Device) {
+    this.#compiled = new CompiledPrograms(device);
+  }
+
+  /** Whether a picture can be shown without waiting for compilers; have them begin if not. */
+  isReady({ level, scale }: Setting, isDifference: boolean): boolean {
+    const { raysAcross, resolution } = LEVELS[level];
+    const areReady = [
+      this.#isReady('present.glsl', modeOf(isDifference)),
+      raysAcross === 1 || this.#isReady('average.glsl'),
+      resolution * scale === 1 || this.#isReady('enlarge.glsl'),
+    ];
+    return areReady.every((isReady) => isReady);
+  }
 
   /** Return a target of a size; the last used are kept. */
   target(name: string, width: number, height: number, isExact: boolean): Target {
@@ -71,7 +90,7 @@ export class Presentation {
     const isBlended = opacity < 1;
     const isSameSize = picture.width === width && picture.height === height;
     const canvas = isSameSize ? null : this.#canvasOf(picture.width, picture.height);
-    const present = this.#program('present.glsl', { MODE: still ? SHOWN.difference : SHOWN.colour });
+    const present = this.#program('present.glsl', modeOf(still !== null));
     device.set(present, {
       rgba: UNIT.rgba,
       sums: UNIT.sums,
@@ -95,20 +114,22 @@ export class Presentation {
   }
 
   release(): void {
-    for (const program of this.#programs.values()) this.device.release(program);
+    this.#compiled.release();
     for (const target of this.#targets.values()) this.#release(target);
-    this.#programs.clear();
     this.#targets.clear();
     this.#releaseCanvas();
   }
 
   #program(name: string, defines: Defines = {}): Program {
-    const key = JSON.stringify([name, defines]);
-    const program =
-      this.#programs.get(key) ??
-      this.device.program(this.device.compile(name, { CONTRACTED: 0, NDC: 0, ...defines }, {}));
-    this.#programs.set(key, program);
-    return program;
+    return this.#compiled.get(JSON.stringify([name, defines]), () => this.#begin(name, defines));
+  }
+
+  #isReady(name: string, defines: Defines = {}): boolean {
+    return this.#compiled.isReady(JSON.stringify([name, defines]), () => this.#begin(name, defines));
+  }
+
+  #begin(name: string, defines: Defines): Compilation {
+    return this.device.compile(name, { CONTRACTED: 0, NDC: 0, ...defines }, {});
   }
 
   #newTarget(width: number, height: number, isExact: boolean): Target {

@@ -8,9 +8,10 @@
  */
 
 import { type Camera, isSameView, texelsPerPixel } from './camera.js';
-import { Device, RenderError } from './device.js';
+import { contextOf, RenderError } from './context.js';
+import { Device } from './device.js';
 import { DrawnScene } from './drawn_scene.js';
-import { Pace, type Rung } from './pace.js';
+import { Pace, type Setting } from './pace.js';
 import { type Keeping, type Moment, type Picture, PictureJob, type ShownPart, type View } from './picture_job.js';
 import { Presentation, type Screen } from './presentation.js';
 import { LEVELS, type Level } from './quality.js';
@@ -19,7 +20,7 @@ import { Timer } from './timer.js';
 
 export interface DrawOptions {
   /** `auto` takes the finest level at which frames come in time, and draws finely once all stands still. */
-  level?: Level | Rung | 'auto';
+  level?: Level | Setting | 'auto';
   /** `dynamic` shows the difference between all and the static part. */
   part?: ShownPart;
   /** An embedding of the scene, or between two of them; null is the average appearance. */
@@ -50,7 +51,7 @@ export interface RendererOptions {
 }
 
 /** What is drawn once all stands still. */
-const STILL: Rung = { level: 'fine', scale: 1 };
+const STILL: Setting = { level: 'fine', scale: 1 };
 /** Seconds that a part of a picture may take, so that the page stays alive and drivers do not think that all hangs. */
 const MOST_SECONDS = 0.25;
 /** Seconds for a ray, until it is known: of a card, and of a processor in its place. */
@@ -68,7 +69,7 @@ const STILL_ROLE = 'still';
 interface Shown {
   view: View;
   versions: string;
-  rung: Rung;
+  setting: Setting;
   role: string;
   pictures: Picture[];
 }
@@ -152,6 +153,11 @@ export class Renderer {
     if (this.#scenes.delete(scene)) scene.release();
   }
 
+  /** Have shaders compiled that `draw` will need, while planes are still to come. */
+  prepare(camera: Camera, moments: readonly Moment[], options: DrawOptions = {}): void {
+    if (!this.isLost) this.#isReady(viewOf(camera, moments, options), this.#wanted(camera, moments, options));
+  }
+
   /**
    * Draw what a camera sees, or go on with that; call it on each animation frame until the picture is sharp.
    *
@@ -161,7 +167,7 @@ export class Renderer {
   draw(camera: Camera, moments: readonly Moment[], options: DrawOptions = {}): DrawnPicture {
     const { level = 'auto' } = options;
     const isAuto = level === 'auto';
-    const wanted = isAuto ? this.pace.rung(texelsPerPixel(moments[0].scene.source, camera)) : rungOf(level);
+    const wanted = this.#wanted(camera, moments, options);
     if (this.isLost || this.#timer.isBusy) return this.#state(wanted, false);
     for (const scene of this.#scenes) scene.upload(this.#device);
     const view = viewOf(camera, moments, options);
@@ -170,16 +176,17 @@ export class Renderer {
     const isShown = isStill && this.#shown?.versions === versions;
     if (this.#job?.role === STILL_ROLE && !isSame(this.#job.view, view)) this.#job = null;
     if (this.#job === null) {
-      const isSharp = isShown && (isAuto ? this.#shown?.rung === STILL : isSameRung(this.#shown?.rung, wanted));
+      const isSharp =
+        isShown && (isAuto ? this.#shown?.setting === STILL : isSameSetting(this.#shown?.setting, wanted));
       if (isSharp) {
         if (options.screen) this.present(options.screen);
         return this.#state(wanted, true);
       }
       // What was sharp stays so while more planes arrive.
-      const sharpens = isAuto && (isShown || (isStill && this.#shown?.rung === STILL));
-      const rung = sharpens ? STILL : wanted;
-      if (!this.#isReady(view, rung)) return this.#state(wanted, false);
-      this.#job = this.#newJob(view, rung);
+      const sharpens = isAuto && (isShown || (isStill && this.#shown?.setting === STILL));
+      const setting = sharpens ? STILL : wanted;
+      if (!this.#isReady(view, setting)) return this.#state(wanted, false);
+      this.#job = this.#newJob(view, setting);
       this.#job.versions = versions;
     }
     this.#goOn(this.#job, isAuto, options.screen ?? null);
@@ -204,11 +211,11 @@ export class Renderer {
    */
   async read(camera: Camera, moments: readonly Moment[], options: DrawOptions & { isCounted?: boolean } = {}) {
     const { level = 'auto' } = options;
-    const rung = level === 'auto' ? STILL : rungOf(level);
+    const setting = level === 'auto' ? STILL : settingOf(level);
     const keeping = { role: 'read', isExact: true, isCounted: options.isCounted ?? false };
     await this.#untilIdle();
     for (const scene of this.#scenes) scene.upload(this.#device);
-    const job = new PictureJob(viewOf(camera, moments, options), rung, this.#presentation, keeping);
+    const job = new PictureJob(viewOf(camera, moments, options), setting, this.#presentation, keeping);
     while (job.rowsLeft > 0) {
       this.#march(job, MOST_SECONDS, () => {});
       this.#timer.finish();
@@ -233,20 +240,26 @@ export class Renderer {
     this.#device.dispose();
   }
 
+  #wanted(camera: Camera, moments: readonly Moment[], { level = 'auto' }: DrawOptions): Setting {
+    return level === 'auto' ? this.pace.setting(texelsPerPixel(moments[0].scene.source, camera)) : settingOf(level);
+  }
+
   /** Whether no compiler keeps a picture waiting. */
-  #isReady({ moments, part }: View, { level }: Rung): boolean {
+  #isReady({ moments, part }: View, setting: Setting): boolean {
+    this.#device.hasTaken = false;
     const parts = { all: [true], static: [false], dynamic: [true, false] }[part];
     const areReady = moments.flatMap(({ scene }) =>
-      parts.map((isMoving) => scene.isReady(this.#device, LEVELS[level], isMoving)),
+      parts.map((isMoving) => scene.isReady(this.#device, LEVELS[setting.level], isMoving)),
     );
+    areReady.push(this.#presentation.isReady(setting, part === 'dynamic'));
     return areReady.every((isReady) => isReady);
   }
 
-  #newJob(view: View, rung: Rung): PictureJob {
-    const keeping = (role: string): Keeping => ({ role, isExact: rung.level === 'reference', isCounted: false });
-    if (rung === STILL) return new PictureJob(view, rung, this.#presentation, keeping(STILL_ROLE));
+  #newJob(view: View, setting: Setting): PictureJob {
+    const keeping = (role: string): Keeping => ({ role, isExact: setting.level === 'reference', isCounted: false });
+    if (setting === STILL) return new PictureJob(view, setting, this.#presentation, keeping(STILL_ROLE));
     const role = this.#shown?.role === LIVE[0] ? LIVE[1] : LIVE[0];
-    return new PictureJob(view, rung, this.#presentation, keeping(role));
+    return new PictureJob(view, setting, this.#presentation, keeping(role));
   }
 
   /** March as many rows as there is time for, and show the picture if these were the last. */
@@ -256,8 +269,8 @@ export class Renderer {
       if (isAuto && !isStill && job.rowsLeft === 0) this.pace.record(job.raysPerPixel, job.seconds);
     });
     if (job.rowsLeft === 0) {
-      const { view, rung, role, versions = '' } = job;
-      this.#shown = { view, rung, role, versions, pictures: job.finish(this.#presentation) };
+      const { view, setting, role, versions = '' } = job;
+      this.#shown = { view, setting, role, versions, pictures: job.finish(this.#presentation) };
       this.#job = null;
       this.#pictures++;
       this.present(screen);
@@ -279,8 +292,8 @@ export class Renderer {
     job.march(this.#device, rows);
   }
 
-  #state(wanted: Rung, isSharp: boolean): DrawnPicture {
-    return { ...(this.#shown?.rung ?? wanted), isSharp, pictures: this.#pictures };
+  #state(wanted: Setting, isSharp: boolean): DrawnPicture {
+    return { ...(this.#shown?.setting ?? wanted), isSharp, pictures: this.#pictures };
   }
 
   async #untilIdle(): Promise<void> {
@@ -303,14 +316,6 @@ export class Renderer {
   };
 }
 
-function contextOf(canvas: HTMLCanvasElement | OffscreenCanvas): WebGL2RenderingContext {
-  const wanted = { alpha: false, antialias: false, depth: false, stencil: false, powerPreference: 'high-performance' };
-  const gl = canvas.getContext('webgl2', wanted as WebGLContextAttributes) as WebGL2RenderingContext | null;
-  if (gl === null)
-    throw new RenderError('this browser has no WebGL2; update it, or allow it to use the graphics card', 'no-webgl');
-  return gl;
-}
-
 function viewOf(camera: Camera, moments: readonly Moment[], options: DrawOptions): View {
   const { part = 'all', appearance = null, background = null } = options;
   return { camera, moments, part, appearance, background };
@@ -328,6 +333,6 @@ function isSame(a: View, b: View): boolean {
   );
 }
 
-const rungOf = (level: Level | Rung): Rung => (typeof level === 'string' ? { level, scale: 1 } : level);
+const settingOf = (level: Level | Setting): Setting => (typeof level === 'string' ? { level, scale: 1 } : level);
 
-const isSameRung = (a: Rung | undefined, b: Rung) => a?.level === b.level && a.scale === b.scale;
+const isSameSetting = (a: Setting | undefined, b: Setting) => a?.level === b.level && a.scale === b.scale;

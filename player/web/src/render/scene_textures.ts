@@ -2,7 +2,9 @@
 
 import { displacementsAt, emptyDistances, Layout, rowWidth, timeRows } from './atlas.js';
 import { columnsOf } from './camera.js';
-import { bytesOf, type Compilation, type Device, type Program, RenderError, type Texture } from './device.js';
+import { CompiledPrograms } from './compiled.js';
+import { RenderError } from './context.js';
+import { bytesOf, type Compilation, type Device, type Program, type Texture } from './device.js';
 import { occupancySlot, type PlaneRows, type SceneSource, type SpacePlane } from './scene_source.js';
 import { constants, type Defines } from './shader.js';
 import { blockArrays, decoderArrays, decoderShape, planesShape } from './shader_constants.js';
@@ -123,8 +125,7 @@ export function sceneDefines(scene: SceneSource, layout: Layout): Defines {
 /** The programs of a scene, compiled when they are first needed, with all uniforms set that never change. */
 export class Programs {
   readonly #decoderWeights: string;
-  readonly #compilations = new Map<string, Compilation>();
-  readonly #programs = new Map<string, Program>();
+  readonly #compiled: CompiledPrograms;
 
   constructor(
     readonly device: Device,
@@ -137,37 +138,32 @@ export class Programs {
       throw new RenderError(`the decoder has ${count} weights, a shader takes ${4 * MOST_CONSTANTS}`);
     }
     this.#decoderWeights = constants(arrays);
+    this.#compiled = new CompiledPrograms(device);
   }
 
   /** Whether a program is compiled; begin with it if not. */
   isReady(name: string, layout: Layout, defines: Defines): boolean {
-    return (
-      this.#programs.has(keyOf(name, layout, defines)) || this.device.isCompiled(this.#begun(name, layout, defines))
+    return this.#compiled.isReady(
+      keyOf(name, layout, defines),
+      () => this.#begin(name, layout, defines),
+      (program) => this.#setConstant(program),
     );
   }
 
   /** Return a program that reads planes in a layout; `defines` besides those that describe the scene. */
   get(name: string, layout: Layout, defines: Defines = {}): Program {
-    const key = keyOf(name, layout, defines);
-    const known = this.#programs.get(key);
-    if (known !== undefined) return known;
-    const program = this.device.program(this.#begun(name, layout, defines));
-    this.#compilations.delete(key);
-    this.#programs.set(key, program);
-    this.#setConstant(program);
-    return program;
+    return this.#compiled.get(
+      keyOf(name, layout, defines),
+      () => this.#begin(name, layout, defines),
+      (program) => this.#setConstant(program),
+    );
   }
 
-  #begun(name: string, layout: Layout, defines: Defines): Compilation {
-    const key = keyOf(name, layout, defines);
-    const known = this.#compilations.get(key);
-    if (known !== undefined) return known;
+  #begin(name: string, layout: Layout, defines: Defines): Compilation {
     const { scene } = this.textures;
     const macros = { ...sceneDefines(scene, layout), COMPUTE: 0, COUNTED: 0, ...defines };
     const written = { decoder_weights: this.#decoderWeights, plane_blocks: constants(blockArrays(scene, layout)) };
-    const compilation = this.device.compile(name, macros, written);
-    this.#compilations.set(key, compilation);
-    return compilation;
+    return this.device.compile(name, macros, written);
   }
 
   #setConstant(program: Program): void {
@@ -193,9 +189,6 @@ export class Programs {
   }
 
   release(): void {
-    for (const { handle } of this.#compilations.values()) this.device.release({ handle, uniforms: new Map() });
-    this.#compilations.clear();
-    for (const program of this.#programs.values()) this.device.release(program);
-    this.#programs.clear();
+    this.#compiled.release();
   }
 }
