@@ -136,7 +136,7 @@ class Panels:
         imgui.text_disabled(view.device.split("(")[0].strip()[:DEVICE_CHARACTERS])
         imgui.text_disabled(f"drawn by {view.renderer.drawn_by}")
         if view.renderer.is_loading:
-            imgui.text_disabled("faster code is compiled")
+            imgui.text_disabled("compiling faster code")
         if isinstance(self.state.scene.decoder, HybridDecoder):
             imgui.text_disabled("hybrid decoder (slower)")
         if not stream.is_settled:

@@ -18,7 +18,7 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -152,8 +152,17 @@ def _history(options: argparse.Namespace) -> list[str]:
     """Return what is done with the scene, in words for the history of the file."""
     given = {"from": options.start, "to": options.end, "box": options.box, "scale": options.scale,
              "turn": options.turn, "move": options.move, "speed": options.speed, "fps": options.fps}  # fmt: skip
-    words = [f"{name} {value}" for name, value in given.items() if value is not None]
+    words = [f"{name} {_in_words(value)}" for name, value in given.items() if value is not None]
     return [f"edited by kpc {VERSION}: {', '.join(words)}"[:256]] if words else []
+
+
+def _in_words(value: Any) -> str:
+    """Return an option's value as it is written on the command line."""
+    if isinstance(value, list) and value and isinstance(value[0], tuple):  # turns
+        return " ".join(f"{axis}:{degrees:g}" for axis, degrees in value)
+    if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str):
+        return ",".join(f"{float(number):g}" for number in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement: Placement | None) -> Metadata:
