@@ -1,4 +1,4 @@
-"""Tiny sounds for tests, made by libav: tones that rise, and clicks whose place can be told."""
+"""Tiny sounds for tests, made by libav: tones that rise, and clicks whose place can be measured."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -78,8 +78,3 @@ def offset_of(found: np.ndarray, expected: np.ndarray, most: int = 4000) -> int:
     product = np.fft.rfft(found, size) * np.fft.rfft(expected, size).conj()
     correlation = np.fft.irfft(product, size)
     return int(np.argmax(np.concatenate([correlation[-most:], correlation[:most]]))) - most
-
-
-def snr_db(found: np.ndarray, expected: np.ndarray) -> float:
-    """Return the signal-to-noise ratio of a sound, dB."""
-    return float(10 * np.log10((expected**2).sum() / ((found - expected) ** 2).sum()))

@@ -11,8 +11,9 @@ from kpc.encoder.datasets import Dataset
 from kpc.encoder.datasets.capture import printable
 from kpc.encoder.datasets.sound_tracks import MEASURED_S, Clarity, clarity, clearest, has_sound, read_samples
 from kpc.format.common.errors import UsageError
+from kpc.format.container.clip_sound import sample_at
 from kpc.format.container.groups import Span
-from kpc.format.scene.sound import SAMPLE_RATE, Sound
+from kpc.format.scene.sound import Sound
 
 
 def find_sound(options: Options, dataset: Dataset) -> tuple[Sound | None, str]:
@@ -56,12 +57,7 @@ def sound_of_span(sound: Sound | None, span: Span, fps: float) -> Sound | None:
     """Return the sound of some frames of a clip (spec/kpc-format.md, "Groups")."""
     if sound is None:
         return None
-    return sound.part(sample_of_frame(span.start, fps), sample_of_frame(span.count, fps))
-
-
-def sample_of_frame(frame: float, fps: float) -> int:
-    """Return the sample that is heard when a frame is first shown."""
-    return int(SAMPLE_RATE * frame / fps + 0.5)
+    return sound.part(sample_at(span.start, fps), sample_at(span.count, fps))
 
 
 def _videos(dataset: Dataset) -> dict[str, Path]:

@@ -49,12 +49,13 @@ def parts_of(groups: Groups, first: int, stop: int) -> Iterator[tuple[int, Sound
     """Yield what is heard from sample `first` to `stop` of a clip: sounds in their order, each with how many samples it
     lasts. A sound may be shorter than that, and silence, None, may be between them.
     """
-    for span in sound_spans(groups.timeline):
+    spans = sound_spans(groups.timeline)
+    for span in spans:
         begin, end = max(first, span.first), min(stop, span.stop)
         if begin < end:
             sound = groups.open(span.group).sound() if groups.available(span.group) else None
             yield end - begin, None if sound is None else sound.part(begin - span.start, end - begin)
-    if stop > (last := sound_spans(groups.timeline)[-1].stop):
+    if stop > (last := spans[-1].stop):
         yield stop - max(first, last), None
 
 

@@ -53,15 +53,6 @@ def decode_packets(packets: Sequence[bytes], channels: int) -> np.ndarray:
     return found
 
 
-def can_decode() -> bool:
-    """Return whether there is a decoder."""
-    try:
-        _soundfile()
-    except MediaError:
-        return False
-    return True
-
-
 def _soundfile() -> Any:
     try:
         import soundfile  # late: it loads a library of several megabytes

@@ -9,13 +9,14 @@ import pytest
 import datasets as make
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.options import Options
-from kpc.encoder.cli.sound import find_sound, sample_of_frame, sound_of_span
+from kpc.encoder.cli.sound import find_sound, sound_of_span
 from kpc.encoder.coding.opus import encode_sound
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.datasets.sound_tracks import clarity, read_samples
 from kpc.encoder.field.config import PRESETS
 from kpc.encoder.rdo.model_checkpoint import read_checkpoint
 from kpc.format.common.errors import MediaError, UsageError
+from kpc.format.container.clip_sound import sample_at
 from kpc.format.container.groups import Groups, Span
 from kpc.format.scene.sound import SAMPLE_RATE
 from sounds import add_track, decoded, offset_of, sweep, with_noise, write_track
@@ -128,8 +129,8 @@ def test_groups_hold_their_own_samples_and_go_on_without_a_click():
     parts = [sound_of_span(sound, span, fps) for span in spans]
     whole = decoded(sound)
     for span, part in zip(spans, parts, strict=True):
-        start = sample_of_frame(span.start, fps)
-        assert part.sample_count == sample_of_frame(span.count, fps)
+        start = sample_at(span.start, fps)
+        assert part.sample_count == sample_at(span.count, fps)
         expected = whole[start : start + part.sample_count]
         assert np.abs(decoded(part) - expected).max() < 0.005  # -46 dB, and 16 bits
     assert sound_of_span(None, spans[0], fps) is None
@@ -144,8 +145,8 @@ def test_a_group_and_its_checkpoint_hold_the_sound_of_their_frames(folder, tmp_p
     assert capsys.readouterr().err.count("sound: ") == 1
     groups = Groups(out)
     (span,), sound = groups.timeline.spans, groups.open(0).sound()
-    start = sample_of_frame(span.start, groups.clip.fps)
-    assert start > 0 and sound.sample_count == sample_of_frame(span.count, groups.clip.fps)
+    start = sample_at(span.start, groups.clip.fps)
+    assert start > 0 and sound.sample_count == sample_at(span.count, groups.clip.fps)
     assert offset_of(decoded(sound)[:, 0], SWEEP[start : start + sound.sample_count]) == 0
     assert groups.open(0).metadata().provenance["options"]["audio"] == "cam02.mp4"
     assert read_checkpoint(kept)[0].sound == sound
