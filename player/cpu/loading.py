@@ -39,14 +39,14 @@ class Loading:
     def run(self, scene: Scene) -> None:
         """Load them; those that are not in numba's cache are compiled by another process first."""
         from kpc.jit import NotCachedError, only_cached
-        from kpc.player.cpu.rehearsal import rehearse
+        from kpc.player.cpu.kernel_warm_up import warm_up_kernels
 
         try:
             with only_cached():
-                rehearse(scene)
+                warm_up_kernels(scene)
         except NotCachedError:
             compile_elsewhere(scene)
-            rehearse(scene)  # where numba's cache cannot be written, this compiles
+            warm_up_kernels(scene)  # where numba's cache cannot be written, this compiles
         self.is_done = True
 
 
@@ -114,7 +114,7 @@ def sketch(scene: Scene) -> Scene:
 
 def compile_elsewhere(scene: Scene) -> None:
     """Have another process compile a scene's kernels into numba's cache, and wait for it."""
-    command = [sys.executable, "-m", "kpc.player.cpu.rehearsal"]
+    command = [sys.executable, "-m", "kpc.player.cpu.kernel_warm_up"]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     atexit.register(process.kill)
     process.communicate(pickle.dumps(scene))

@@ -16,10 +16,10 @@ from kpc.jit import NotCachedError, compiled, only_cached
 from kpc.player.cpu import (
     coarse_to_fine,
     field_kernels,
+    kernel_warm_up,
     lanes,
     loading,
     raymarch,
-    rehearsal,
     reprojection,
     serving,
 )
@@ -98,16 +98,16 @@ def test_nothing_is_loaded_where_the_processor_does_not_draw(monkeypatch: pytest
 def test_only_what_is_not_cached_is_compiled_elsewhere(monkeypatch: pytest.MonkeyPatch, is_cached: bool) -> None:
     called: list[str] = []
 
-    def rehearse(scene: Scene) -> None:
-        called.append("rehearse")
-        if not is_cached and called == ["rehearse"]:
+    def warm_up_kernels(scene: Scene) -> None:
+        called.append("warm up")
+        if not is_cached and called == ["warm up"]:
             raise NotCachedError
 
-    monkeypatch.setattr(rehearsal, "rehearse", rehearse)
+    monkeypatch.setattr(kernel_warm_up, "warm_up_kernels", warm_up_kernels)
     monkeypatch.setattr(loading, "compile_elsewhere", lambda scene: called.append("compile"))
     done = loading.Loading()
     done.run(tiny_scene())
-    assert done.is_done and called == (["rehearse"] if is_cached else ["rehearse", "compile", "rehearse"])
+    assert done.is_done and called == (["warm up"] if is_cached else ["warm up", "compile", "warm up"])
 
 
 def test_threads_do_not_compile_where_only_cached_kernels_may_be_used() -> None:
@@ -121,7 +121,7 @@ def test_threads_do_not_compile_where_only_cached_kernels_may_be_used() -> None:
 
 @pytest.mark.usefixtures("unloaded")
 @pytest.mark.parametrize("variant", [name for name in VARIANTS if serving.serves(VARIANTS[name](tiny_scene(4)))])
-def test_a_rehearsal_leaves_nothing_to_compile(variant: str) -> None:
+def test_warming_up_leaves_nothing_to_compile(variant: str) -> None:
     scene = VARIANTS[variant](tiny_scene(4))
     loading.load(scene)
     renderer, before = Renderer(gl.context(), scene, processor=True), signatures(MODULES)
@@ -141,6 +141,6 @@ def test_a_sketch_is_of_the_same_kind_and_small() -> None:
             assert all(np.all(plane == ("t" in name)) for scale in small.scales for name, plane in scale.items())
 
 
-def test_another_process_rehearses() -> None:
-    command = [sys.executable, "-m", "kpc.player.cpu.rehearsal"]
+def test_another_process_warms_up() -> None:
+    command = [sys.executable, "-m", "kpc.player.cpu.kernel_warm_up"]
     subprocess.run(command, input=pickle.dumps(loading.sketch(tiny_scene(4))), check=True)

@@ -1,6 +1,6 @@
-"""A rehearsal of the processor's renderer, after which all of its kernels are compiled or loaded.
+"""Warming up of the processor's renderer, after which all of its kernels are compiled or loaded.
 
-As a program it reads a pickled scene from its standard input, `python -m kpc.player.cpu.rehearsal`, and so fills
+As a program it reads a pickled scene from its standard input, `python -m kpc.player.cpu.kernel_warm_up`, and so fills
 numba's cache for another process.
 """
 
@@ -28,7 +28,7 @@ PICTURES = 3
 NICENESS = 5
 
 
-def rehearse(scene: Scene) -> None:
+def warm_up_kernels(scene: Scene) -> None:
     """Draw small pictures of a scene at all levels that the processor draws."""
     layout = Layout.of(scene)
     atlas = np.zeros((*layout.size[::-1], 4), np.float32)
@@ -47,4 +47,4 @@ def rehearse(scene: Scene) -> None:
 if __name__ == "__main__":
     with contextlib.suppress(AttributeError, OSError):
         os.nice(NICENESS)
-    rehearse(pickle.load(sys.stdin.buffer))
+    warm_up_kernels(pickle.load(sys.stdin.buffer))
