@@ -81,18 +81,17 @@ def scene_page(scene: SharedScene, *, root: str = "", url: str | None = None, ho
     document = scene.metadata.document
     if credit := [str(document[key]) for key in ("author", "licence", "date") if document.get(key)]:
         about.append(f"<p>{escape(', '.join(credit))}</p>")
-    return _filled(
+    body = _filled(
         "scene.html",
-        policy=Template(POLICY).substitute(hosts=escape(hosts)),
         title=escape(scene.title),
-        description=escape(scene.description),
-        preview=_preview(POSTER if scene.has_poster else None, url),
-        root=root,
         scene=escape(scene.address),
         poster=f' poster="{POSTER}"' if scene.has_poster else "",
         about="\n".join(about),
         back=f'<p><a href="{root}{PAGE}">All scenes</a></p>' if root else "",
     )
+    script = f'<script type="module" src="{root}{PLAYER_FILES[0]}"></script>'
+    preview = _preview(POSTER if scene.has_poster else None, url)
+    return _page(body, scene.title, scene.description, preview, root=root, hosts=hosts, script=script)
 
 
 def gallery_page(scenes: Mapping[str, SharedScene], title: str, url: str | None = None) -> str:
@@ -110,14 +109,8 @@ def gallery_page(scenes: Mapping[str, SharedScene], title: str, url: str | None 
         first_poster = first_poster or (f"{place}/{POSTER}" if scene.has_poster else None)
         cards.append(f'<li><a href="{place}/{PAGE}">{image}<h2>{escape(scene.title)}</h2><p>{scene.facts}</p></a></li>')
     count = f"{len(scenes)} scene{'s' * (len(scenes) != 1)} to look at from all sides."
-    return _filled(
-        "gallery.html",
-        policy=Template(POLICY).substitute(hosts=""),
-        title=escape(title),
-        description=count,
-        preview=_preview(first_poster, url),
-        cards="\n".join(cards),
-    )
+    body = _filled("gallery.html", title=escape(title), description=count, cards="\n".join(cards))
+    return _page(body, title, count, _preview(first_poster, url))
 
 
 def embed_snippet(scene: SharedScene, root: str = "", url: str | None = None) -> str:
@@ -151,8 +144,8 @@ def write_file(path: Path, content: str | bytes) -> None:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def copy_scene(source: Path, target: Path) -> None:
-    """Copy a .kpc file, whole or not at all; a file that lies there already stays."""
+def copy_file(source: Path, target: Path) -> None:
+    """Copy a file, whole or not at all; a file that lies there already stays."""
     if target.exists() and target.samefile(source):
         return
     with atomic_write(target) as temporary:
@@ -187,6 +180,22 @@ def _preview(poster: str | None, url: str | None) -> str:
         lines.append(f'<meta property="og:image" content="{escape(urljoin(url or "", poster))}">')
         lines.append('<meta name="twitter:card" content="summary_large_image">')
     return "\n".join(lines)
+
+
+def _page(
+    body: str, title: str, description: str, preview: str, *, root: str = "", hosts: str = "", script: str = ""
+) -> str:
+    """Return a whole page around a body, which is markup, as are preview and script; title and description are not."""
+    return _filled(
+        "page.html",
+        policy=Template(POLICY).substitute(hosts=escape(hosts)),
+        title=escape(title),
+        description=escape(description),
+        preview=preview,
+        root=root,
+        script=script,
+        body=body,
+    )
 
 
 def _filled(template: str, **values: str) -> str:

@@ -11,6 +11,7 @@ browser on this machine.
 
 import argparse
 import sys
+import tempfile
 from pathlib import Path
 from urllib.parse import urljoin, urlsplit
 
@@ -24,7 +25,7 @@ from kpc.player.sharing import site
 from kpc.player.sharing.site import SharedScene
 from kpc.tools.rendering.poster import render_poster
 
-# Of JPEG: posters are seen for a second, and are to be no larger than scenes.
+# The quality of posters as JPEG: they are seen for a second, and are to be no larger than scenes.
 POSTER_QUALITY = 80
 
 
@@ -43,17 +44,20 @@ def _command(argv: list[str]) -> None:
     folders = [folder / name if is_gallery else folder for name in names]
     for one in folders if is_gallery else ():
         site.check_folder(one)
-    for file in files:
-        kpc.load(file)  # nothing is written if one of them cannot be read
-    folder.mkdir(parents=True, exist_ok=True)
-    site.copy_player(folder)
     root = "../" if is_gallery else ""
-    scenes: dict[str, SharedScene] = {}
-    for file, name, place in progress(list(zip(files, names, folders, strict=True)), "kpshare", unit="scenes"):
-        place.mkdir(exist_ok=True)
-        scenes[name] = _share(file, name, place)
-        url = None if options.url is None else urljoin(options.url, f"{name}/" if is_gallery else "")
-        site.write_file(place / site.PAGE, site.scene_page(scenes[name], root=root, url=url))
+    with tempfile.TemporaryDirectory() as aside:
+        # Nothing is written into the folder if one of the scenes cannot be read.
+        posters = [Path(aside) / f"{name}.jpg" for name in names]
+        inputs = progress(list(zip(files, names, posters, strict=True)), "kpshare", unit="scenes")
+        scenes = {name: _read(file, name, poster) for file, name, poster in inputs}
+        folder.mkdir(parents=True, exist_ok=True)
+        site.copy_player(folder)
+        for file, (name, scene), poster, place in zip(files, scenes.items(), posters, folders, strict=True):
+            place.mkdir(exist_ok=True)
+            site.copy_file(file, place / scene.address)
+            site.copy_file(poster, place / site.POSTER)
+            url = None if options.url is None else urljoin(options.url, f"{name}/" if is_gallery else "")
+            site.write_file(place / site.PAGE, site.scene_page(scene, root=root, url=url))
     if is_gallery:
         title = options.title or (options.gallery or folder).absolute().name
         site.write_file(folder / site.PAGE, site.gallery_page(scenes, title, options.url))
@@ -99,14 +103,12 @@ def _inputs(options: argparse.Namespace) -> list[Path]:
     return inputs
 
 
-def _share(file: Path, name: str, folder: Path) -> SharedScene:
-    """Put a scene and its poster into the folder of its page."""
+def _read(file: Path, name: str, poster: Path) -> SharedScene:
+    """Read a scene, write its poster, and return what its page is to say."""
     loaded = kpc.load(file)
     scene, _ = loaded.at(0.0)
-    write_image(folder / site.POSTER, render_poster(loaded), POSTER_QUALITY)
-    address = f"{name}.kpc"
-    site.copy_scene(file, folder / address)
-    return SharedScene(address, file.stem, scene.metadata, loaded.clip, file.stat().st_size, has_poster=True)
+    write_image(poster, render_poster(loaded), POSTER_QUALITY)
+    return SharedScene(f"{name}.kpc", file.stem, scene.metadata, loaded.clip, file.stat().st_size, has_poster=True)
 
 
 def _url(text: str) -> str:
