@@ -7,7 +7,6 @@ each must be trained on, held out or left out. Anything else, and more than HANG
 datasets are written to -o. Dataset number N of a seed is always the same.
 """
 
-import argparse
 import contextlib
 import faulthandler
 import io
@@ -31,11 +30,12 @@ from kpc.encoder.datasets import load_dataset
 from kpc.encoder.datasets.left_out import media_in
 from kpc.encoder.datasets.plausibility import doubts
 from kpc.format.common import cli
-from kpc.format.common.errors import DatasetError, KpcError, MediaError, UsageError
+from kpc.format.common.errors import DatasetError, KpcError, MediaError
 from kpc.format.common.films import write_video
 from kpc.format.common.images import write_image
 from kpc.format.common.progress import progress
 from kpc.format.scene.camera_models import COLMAP_NUMBERS, PARAMETERS
+from kpc.tools.dev.fuzz_options import check_range, fuzz_parser
 from kpc.tools.vectors.fuzz import scrambled
 
 HANG_S = 5.0  # seconds of processor time that count as a hang
@@ -439,14 +439,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser("fuzz_datasets", description="Load datasets that are damaged in many ways.")
-    parser.add_argument("--count", type=int, default=1000, help="of datasets (default: %(default)s)")
-    parser.add_argument("--first", type=int, default=0, help="number of the first of them (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="other datasets (default: %(default)s)")
-    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write what is found here")
+    parser = fuzz_parser("fuzz_datasets", "Load datasets that are damaged in many ways.", "datasets", 1000)
     options = parser.parse_args(argv)
-    if options.count < 1 or options.first < 0:
-        raise UsageError("--count must be positive, and --first not negative")
+    check_range(options)
     outcomes, findings = run(options.count, options.seed, options.first, shown=True)
     for n, what in findings:
         print(f"dataset {n}: {what}", file=sys.stderr)

@@ -11,7 +11,6 @@ web` lets the browser player read them, under node.
 The mutations and the processes that try them are one module because neither is used elsewhere.
 """
 
-import argparse
 import json
 import multiprocessing
 import os
@@ -39,6 +38,7 @@ from kpc.format.container.partial import PartialScene
 from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.container.scene_layout import GROUP_KIND
 from kpc.format.scene.scene import ALL_PLANES
+from kpc.tools.dev.fuzz_options import check_range, fuzz_parser
 from kpc.tools.vectors import specvectors
 from kpc.tools.vectors.files import ENTRY_FIELDS, HEADER_FIELDS, sealed, with_entry, with_index
 from kpc.tools.vectors.web_reader import WebReader
@@ -494,21 +494,16 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser("fuzz", description="Read files that are damaged in every way there is.")
-    parser.add_argument("--count", type=int, default=10_000, help="of files (default: %(default)s)")
-    parser.add_argument("--first", type=int, default=0, help="number of the first of them (default: %(default)s)")
+    parser = fuzz_parser("fuzz", "Read files that are damaged in every way there is.", "files", 10_000)
     parser.add_argument("--processes", type=int, default=1, help="at a time (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="other files (default: %(default)s)")
     parser.add_argument("--only", default="", metavar="NAME,...", help="vectors whose names begin so (default: all)")
     parser.add_argument(
         "--reader", choices=("python", "web"), default="python", help="which reads them (default: %(default)s)"
     )
-    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write what is found here")
     options = parser.parse_args(argv)
-    if min(options.count, options.processes) < 1:
-        raise UsageError("--count and --processes must be positive")
-    if options.first < 0:
-        raise UsageError("--first must not be negative")
+    check_range(options)
+    if options.processes < 1:
+        raise UsageError("--processes must be positive")
     if options.only and not seeds(options.only):
         raise UsageError(f"--only {options.only}: no vector's name begins so")
     found = run(

@@ -6,7 +6,6 @@ a FormatError. Anything else that is raised, more than HANG_S of computing and m
 Body number N of a seed is always the same, so that a run may be split by --first and --count.
 """
 
-import argparse
 import json
 import random
 import sys
@@ -20,12 +19,13 @@ from typing import Any
 
 from kpc.format.coding.quantise import project_occupancy
 from kpc.format.common import cli
-from kpc.format.common.errors import FormatError, KpcError, UsageError
+from kpc.format.common.errors import FormatError, KpcError
 from kpc.format.container.container import Codec
 from kpc.format.container.groups import Groups
 from kpc.format.container.scene_io import SceneReader
 from kpc.format.core import core, decoding
 from kpc.format.scene.scene import ALL_PLANES
+from kpc.tools.dev.fuzz_options import check_range, fuzz_parser
 from kpc.tools.vectors import specvectors
 from kpc.tools.vectors.fuzz import BUDGET, HANG_S, LONG, scrambled
 
@@ -134,14 +134,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser("fuzz_bodies", description="Decode damaged bodies of all codecs by the core.")
-    parser.add_argument("--count", type=int, default=10_000, help="of bodies (default: %(default)s)")
-    parser.add_argument("--first", type=int, default=0, help="number of the first of them (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="other bodies (default: %(default)s)")
-    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write what is found here")
+    parser = fuzz_parser("fuzz_bodies", "Decode damaged bodies of all codecs by the core.", "bodies", 10_000)
     options = parser.parse_args(argv)
-    if options.count < 1 or options.first < 0:
-        raise UsageError("--count must be positive, and --first not negative")
+    check_range(options)
     found = run(options.count, options.seed, options.first, lambda text: print(text, file=sys.stderr, flush=True))
     if options.output is not None and found["findings"]:
         options.output.mkdir(parents=True, exist_ok=True)
