@@ -1,6 +1,6 @@
 """Coding of sound as Opus (RFC 6716), by libopus through PyAV.
 
-The encoder is told to hold its delay low, so that it uses the transform coder (CELT) alone. A decoder that begins
+The encoder is set to a low delay, so that it uses the transform coder (CELT) alone. A decoder that begins
 within such a stream settles in a few packets, where one of the predictive coder (SILK) never does: cut after 80 ms of
 pre-roll, a voice at 48 kbit/s was off by an RMS of 0.066 of full scale under "audio" and of 0.007 under "lowdelay".
 """

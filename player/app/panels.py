@@ -300,7 +300,7 @@ class Panels:
 
 
 def shortened(name: str) -> str:
-    """Return the name of a file with at most NAME_CHARACTERS, and its end, which tells takes apart."""
+    """Return the name of a file with at most NAME_CHARACTERS, and its end, by which takes differ."""
     half = (NAME_CHARACTERS - 2) // 2
     return name if len(name) <= NAME_CHARACTERS else f"{name[:half]}..{name[-half:]}"
 

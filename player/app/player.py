@@ -353,7 +353,7 @@ class Player:
 
     @property
     def _plays_sound(self) -> bool:
-        """Whether the clip runs as it is heard: at its own speed, on no camera path."""
+        """Whether the clip runs as its sound does: at its own speed, on no camera path."""
         state = self.state
         is_natural = state.playback.playing and state.playback.speed == 1.0
         is_on_path = state.follower.is_active or self.filming.is_along_path

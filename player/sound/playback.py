@@ -1,8 +1,8 @@
 """Playing the sound of a clip in step with its pictures: the clock of the clip follows the device.
 
 A thread decodes ahead of the playhead; a thread of the device pulls what is decoded. In each frame the window's thread
-asks `advance` by how much the clip is to go on, and tells `follow` where it is: a sound that is elsewhere, after a seek
-or a pause, begins anew there.
+asks `advance` by how much the clip is to go on, and passes its position to `follow`: a sound that is elsewhere, after a
+seek or a pause, begins anew there.
 """
 
 import math
@@ -72,7 +72,7 @@ class SoundPlayback:
         self._thread: threading.Thread | None = None
 
     def set_volume(self, volume: float) -> None:
-        """Set the volume, 0 for silence and 1 for the sound as it is."""
+        """Set the volume, 0 for silence and 1 for the sound unchanged."""
         self._queue.volume = volume * volume  # about as loudness is heard
 
     def advance(self, seconds: float, time_s: float) -> float:

@@ -1,7 +1,7 @@
 /**
  * Builds the player: `node build.mjs` writes dist/, `node build.mjs --test [NAME ...]` runs all tests or those,
- * `node build.mjs --out FOLDER` writes to another folder, `node build.mjs --page FILE --out FOLDER` bundles a script of a
- * page that tests open.
+ * `node build.mjs --out FOLDER` writes to another folder, `node build.mjs --page FILE --out FOLDER` bundles a script of
+ * a page that tests open.
  *
  * Everything is inlined: the decoder core (format/core), the shaders (player/gl/glsl), the schema of metadata (spec),
  * and the text of the worker, which `import source from './worker.ts?text'` bundles. Nothing is copied.

@@ -1,7 +1,7 @@
 """What `kpbench web` measures: what pictures in a browser look up, how near they are to the reference, and how fast a
 processor draws them.
 
-None of the machines at hand has the graphics card of a telephone, so what a picture looks up is counted, by a variant
+None of the project's machines has the graphics card of a telephone, so what a picture looks up is counted, by a variant
 of the shader, and divided by what such a card can look up.
 """
 

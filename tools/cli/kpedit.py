@@ -157,7 +157,7 @@ def _history(options: argparse.Namespace) -> list[str]:
 
 
 def _in_words(value: Any) -> str:
-    """Return an option's value as it is written on the command line."""
+    """Return an option's value in the form of the command line."""
     if isinstance(value, list) and value and isinstance(value[0], tuple):  # turns
         return " ".join(f"{axis}:{degrees:g}" for axis, degrees in value)
     if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str):

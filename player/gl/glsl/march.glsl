@@ -207,8 +207,8 @@ void add_sample(inout Sums sums, vec4 logits, float thickness, float distance) {
     sums.samples += 1.0;
 }
 
-// rgba: colour and opacity; depth_samples: sum of weight times distance, number of samples and, COUNTED, of cells looked
-// up.
+// rgba: colour and opacity; depth_samples: sum of weight times distance, number of samples and, COUNTED, of cells
+// looked up.
 void march(vec2 fragment, out vec4 rgba, out vec4 depth_samples) {
     Path path = path_of(eye, camera_direction(fragment, height, lens, axes), frame, near, baseline);
     Walk walk = walk_of(path.origin, path.direction, box_low, box_high, cell_count, stride, uniform_distance);

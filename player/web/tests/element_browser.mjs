@@ -1,8 +1,8 @@
 /**
  * Watches <kpc-player> in headless Chromium: `node element_browser.mjs ADDRESS CHROMIUM FOLDER [NAME ...]`.
  *
- * The server at ADDRESS has the files and faults of tests/player/test_web_player.py, and page.html is what its query says.
- * Writes a JSON object on one line: for each scenario {error, value}. Pictures of pages go to FOLDER.
+ * The server at ADDRESS has the files and faults of tests/player/test_web_player.py, and page.html is what its query
+ * says. Writes a JSON object on one line: for each scenario {error, value}. Pictures of pages go to FOLDER.
  */
 
 import assert from 'node:assert/strict';

@@ -7,7 +7,9 @@ import { costOf, Pace, settingsOf } from '../src/render/pace.js';
 
 const FRAME = 1 / 30;
 
-/** Draw frames on a device that takes `fixed` seconds and `perRay` for each ray of a pixel; return all settings' costs. */
+/**
+ * Draw frames on a device that takes `fixed` seconds and `perRay` for each ray of a pixel; return all settings' costs.
+ */
 function play(pace: Pace, perRay: number, fixed: number, frames: number): number[] {
   return Array.from({ length: frames }, (_, i) => {
     const setting = pace.setting(1);

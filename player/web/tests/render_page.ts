@@ -111,7 +111,9 @@ const page = {
     return { pixels: base64(pixels), error: gl.getError(), name: renderer.name };
   },
 
-  /** Draw the rays of a picture; return how many texels and cells they look up, and the colours if none is resampled. */
+  /**
+   * Draw the rays of a picture; return how many texels and cells they look up, and the colours if none is resampled.
+   */
   async counted(job: Job) {
     const renderer = await drawn({ ...job, level: { level: 'fastest', scale: 0.1 } });
     const { moments, options } = await prepared(job);

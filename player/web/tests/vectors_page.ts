@@ -1,4 +1,7 @@
-/** The conformance vectors in a page: a script that a test in Python lets Chromium run (tests/player/test_web_vectors.py). */
+/**
+ * The conformance vectors in a page: a script that a test in Python lets Chromium run
+ * (tests/player/test_web_vectors.py).
+ */
 
 import { Groups } from '../src/container/groups.js';
 import { loadCore } from '../src/decoder/module.js';

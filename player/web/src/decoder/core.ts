@@ -44,7 +44,9 @@ interface Exports {
   [name: string]: unknown;
 }
 
-/** The numbers of a plane segment: symbols [rows][columns][channels], and a byte for each texel, whether it is coded. */
+/**
+ * The numbers of a plane segment: symbols [rows][columns][channels], and a byte for each texel, whether it is coded.
+ */
 export interface SegmentSymbols {
   symbols: Int8Array<ArrayBuffer>;
   coded: Uint8Array<ArrayBuffer>;

@@ -33,7 +33,7 @@ export class Clock {
   #isWaiting = false;
   #sinceUpdate = 0;
 
-  /** @param emit is told what happens. */
+  /** @param emit is called with each event. */
   constructor(readonly emit: (event: ClockEvent) => void) {}
 
   get time(): number {
@@ -72,7 +72,7 @@ export class Clock {
     return this.#paused || this.#ended ? 0 : this.#rate;
   }
 
-  /** Forget the clip; nobody is told. */
+  /** Forget the clip, without an event. */
   reset(): void {
     this.#time = this.duration = this.#sinceUpdate = 0;
     this.frameCount = 1;
@@ -80,7 +80,7 @@ export class Clock {
     this.#ended = this.#isSeeking = this.#isWaiting = this.isHeld = false;
   }
 
-  /** Begin a clip at a time; nobody is told. */
+  /** Begin a clip at a time, without an event. */
   begin(time: number): void {
     this.#time = Math.min(Math.max(time, 0), this.duration);
   }

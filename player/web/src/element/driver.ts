@@ -15,7 +15,7 @@ async function load(options: PoolOptions): Promise<void> {
   try {
     await pool.run({ kind: 'driver' });
   } catch {
-    // The page's own context tells what is wrong.
+    // The page's own context reports what is wrong.
   }
   pool.close();
 }

@@ -87,7 +87,9 @@ export function actionOf({ key, code }: KeyPress): ((commands: Commands) => void
   return Object.hasOwn(ACTIONS, letter) ? ACTIONS[letter] : null;
 }
 
-/** Return where a key flies to; null if it does not. It goes by its place, or by its letter where that has a shortcut. */
+/**
+ * Return where a key flies to; null if it does not. It goes by its place, or by its letter where that has a shortcut.
+ */
 export function flightOf(press: KeyPress): readonly [number, number, number] | null {
   if (actionOf(press) !== null) return null;
   return FLYING[letterOf(press.code)] ?? FLYING[press.key.toLowerCase()] ?? null;

@@ -498,7 +498,7 @@ export class KpcPlayer extends Base implements Model {
     );
     session.fetches = this.preload !== 'metadata' || mayPlay || !this.#clock.paused;
     this.#session = session;
-    // Listeners that are added after the element are told, too.
+    // Listeners that are added after the element get it, too.
     queueMicrotask(() => this.#session === session && this.#emit('loadstart'));
     session.open();
   }

@@ -32,8 +32,8 @@ export function columnsOf(pose: ArrayLike<number>): number[] {
 }
 
 /**
- * Return how many texels of the finest scale a pixel spans: in the middle of the box; in device coordinates about, taking
- * the planes to be as wide as the picture.
+ * Return how many texels of the finest scale a pixel spans: in the middle of the box; in device coordinates about,
+ * taking the planes to be as wide as the picture.
  */
 export function texelsPerPixel(scene: SceneSource, camera: Camera): number {
   const { aabb, scales } = scene.head;

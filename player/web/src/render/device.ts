@@ -46,7 +46,7 @@ export class Device {
   readonly filtersFloat32: boolean;
   /** Whether float32 textures can be drawn to; otherwise float16. */
   readonly drawsFloat32: boolean;
-  /** What draws: the name of the card and its driver, as far as the browser tells it. */
+  /** What draws: the name of the card and its driver, as far as the browser reports it. */
   readonly name: string;
   /** Whether a processor stands in for a graphics card. */
   readonly isSoftware: boolean;

@@ -15,7 +15,9 @@ const SIDES = Array.from({ length: 15 }, (_, i) => 2 ** ((i - 14) / 4));
  * the second number is where they cost more. Figures: docs/benchmarks.md, "Drawing in a browser".
  */
 const COARSE_TEXELS = [1.7, 2];
-/** A raster whose pixels span more than so many texels shows too little; but slow devices may always go to this side. */
+/**
+ * A raster whose pixels span more than so many texels shows too little; but slow devices may always go to this side.
+ */
 const MOST_TEXELS = 3.5;
 const LEAST_SIDE = 0.35;
 
@@ -47,8 +49,8 @@ const DOWN_AFTER = 3;
 const UP_AFTER = 8;
 // Frames for which the time of other costs, and what proved too slow, is remembered.
 const REMEMBERED = 300;
-// Share of the time of a frame below which the next finer setting is tried, whatever is expected of it, and its cost over
-// that of the one before.
+// Share of the time of a frame below which the next finer setting is tried, whatever is expected of it, and its cost
+// over that of the one before.
 const ROOMY = 0.7;
 const NEXT_COST = 1.5;
 // Weight of the fictitious frame without rays that takes no time, so that one known time suffices.
@@ -62,8 +64,9 @@ export function costOf({ level, scale }: Setting, texelsPerPixel: number): numbe
 }
 
 /**
- * Chooses a setting by how long frames took: fixed + perRay cost seconds, fitted to the times of the costs that were tried,
- * as kpc.player.app.resolution_controller does. If the time of one of them changes, those of all do, by the same factor.
+ * Chooses a setting by how long frames took: fixed + perRay cost seconds, fitted to the times of the costs that were
+ * tried, as kpc.player.app.resolution_controller does. If the time of one of them changes, those of all do, by the same
+ * factor.
  */
 export class Pace {
   /** In which a frame is to be drawn. */

@@ -26,7 +26,7 @@ export interface View {
   background: ArrayLike<number> | null;
 }
 
-/** How a picture is kept: its role tells it from others of the same size. */
+/** How a picture is kept: its role distinguishes it from others of the same size. */
 export interface Keeping {
   role: string;
   isExact: boolean; // with float32 numbers and depths

@@ -2,7 +2,7 @@
  * Puts GLSL files together for WebGL2, as kpc.player.gl.shader does for the desktop: there is what the directives mean.
  *
  * The files themselves are those of the desktop, bundled as text, so no formula is written twice. They are composed
- * here, not when the player is built, because loops are unrolled and weights written out for the scene at hand.
+ * here, not when the player is built, because loops are unrolled and weights written out for the scene.
  */
 
 import { SHADER_FILES } from './shader_files.js';

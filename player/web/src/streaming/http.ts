@@ -17,7 +17,9 @@ import type { ReadOptions, Source } from './source.js';
 
 /** Requested on opening: header and index of 1600 chunks, or the first coarse picture of a short clip. */
 export const FIRST_BYTES = 1 << 16;
-/** Bytes of the beginning by which a file is recognised where its ETag or date differs, as between nodes of a server. */
+/**
+ * Bytes of the beginning by which a file is recognised where its ETag or date differs, as between nodes of a server.
+ */
 const BEGINNING_BYTES = 512;
 /** Requests that may fail in a row, until `attempts` is set. */
 const MAX_ATTEMPTS = 5;

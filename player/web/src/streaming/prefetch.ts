@@ -1,5 +1,6 @@
 /**
- * What a player keeps of a scene, and what it fetches next: the order of the desktop player (player/streaming/prefetch.py).
+ * What a player keeps of a scene, and what it fetches next: the order of the desktop player
+ * (player/streaming/prefetch.py).
  *
  *     first   segments at the playhead, of the scales that are shown already
  *     0       scale 0, for a first coarse picture: its space planes, and segments of its time planes at the playhead
@@ -28,7 +29,7 @@ export interface Playhead {
 
 /** A segment of a plane, and the times between which it is needed. */
 export interface Segment {
-  /** Of its chunk in the index. */
+  /** The number of its chunk in the index. */
   number: number;
   scale: number;
   isTime: boolean;

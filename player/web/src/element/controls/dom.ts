@@ -2,7 +2,9 @@
 
 type Properties = Record<string, string | number | boolean | ((event: never) => void)>;
 
-/** Make an element. Properties that begin with `on` are listeners, all others are attributes; `false` leaves one out. */
+/**
+ * Make an element. Properties that begin with `on` are listeners, all others are attributes; `false` leaves one out.
+ */
 export function make<K extends keyof HTMLElementTagNameMap>(
   tag: K,
   properties: Properties = {},
