@@ -138,7 +138,7 @@ def _end_in_time(reader: socket.socket, name: str) -> None:
                 overdue_at = math.inf
             elif count and is_asked:
                 overdue_at = min(overdue_at, time.monotonic() + LONGEST_S)
-    end(name)
+        end(name)  # with the reader open, since Python reports a signal whose number it cannot write
 
 
 def end(name: str) -> None:
