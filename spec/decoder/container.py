@@ -99,9 +99,12 @@ def decompress(frame, length):  # section 4.5
         parameters = zstandard.get_frame_parameters(frame)
         require(parameters.content_size == length, "invalid content size of a Zstandard frame")
         require(parameters.dict_id == 0, "a Zstandard frame uses a dictionary")
-        return zstandard.ZstdDecompressor().decompress(frame, max_output_size=length, allow_extra_data=False)
+        frames = zstandard.ZstdDecompressor().decompressobj()
+        content = frames.decompress(frame)
     except zstandard.ZstdError as error:
         raise Refused("invalid Zstandard frame") from error
+    require(frames.eof and not frames.unused_data, "a Zstandard frame is cut off, or bytes follow it")
+    return content
 
 
 def scene_contents(data, is_prefix):  # sections 4.3 and 4.4
