@@ -1,25 +1,27 @@
 /** The custom element `<kpc-player>`; docs/web.md lists its attributes, properties, methods and events. */
 
-import type { ShownPart } from '../render/picture_job.js';
-import { LEVEL_NAMES, type Level } from '../render/quality.js';
-import { DEFAULT_MEMORY } from '../streaming/clip.js';
-import { positive, set, string, upgrade, word } from './attributes.js';
-import { textOfView, type View, viewFromText, viewOf } from './camera/view.js';
+import { string, upgrade } from './attributes.js';
+import { textOfView } from './camera/view.js';
 import { Clock, type ClockEvent } from './clock.js';
 import type { Model } from './controls/panels.js';
 import { Ui } from './controls/ui.js';
+import { Fullscreen } from './fullscreen.js';
 import { Input } from './input.js';
 import { momentOf } from './link.js';
 import { CONTEXT_LOST, type PlayerError, playerErrorOf } from './messages.js';
+import { PageScroll } from './page_scroll.js';
+import { PlayPromises } from './play_promises.js';
 import { PlayerCommands } from './player_commands.js';
+import { type PlayerRanges, rangesOf } from './ranges.js';
+import { ReflectedElement } from './reflected_element.js';
 import { Session } from './session.js';
 
 const PROPERTIES = [
   ...['src', 'srcObject', 'poster', 'controls', 'autoplay', 'loop', 'muted', 'playsInline', 'preload', 'currentTime'],
   ...['playbackRate', 'volume', 'camera', 'cameraControls', 'quality', 'targetFps', 'appearance', 'memory'],
 ];
-/** Milliseconds between two `progress` events, and after which it is found out anew whether the page scrolls. */
-const [PROGRESS_MS, PAGE_MS] = [350, 1000];
+/** Milliseconds between two `progress` events. */
+const PROGRESS_MS = 350;
 const HAVE_FUTURE_DATA = 3;
 
 /** What a player goes on with when it is put back into a page. */
@@ -29,37 +31,19 @@ interface Resumed {
   wasPlaying: boolean;
 }
 
-/** A list of ranges as `HTMLMediaElement.buffered` has it. */
-export interface PlayerRanges {
-  readonly length: number;
-  start(index: number): number;
-  end(index: number): number;
-}
-
-const Base = (globalThis.HTMLElement ?? class {}) as typeof HTMLElement; // servers that render pages have none
 const connected = new Set<KpcPlayer>();
 
-export class KpcPlayer extends Base implements Model {
+export class KpcPlayer extends ReflectedElement implements Model {
   static readonly observedAttributes = [
-    ...[
-      'src',
-      'poster',
-      'controls',
-      'loop',
-      'camera',
-      'camera-controls',
-      'quality',
-      'target-fps',
-      'part',
-      'appearance',
-    ],
-    ...['autoplay', 'muted'],
+    ...['src', 'poster', 'controls', 'loop', 'camera', 'camera-controls', 'quality', 'target-fps', 'part'],
+    ...['appearance', 'autoplay', 'muted'],
   ];
 
   readonly #clock = new Clock((event) => this.#clocked(event));
   readonly #commands: PlayerCommands;
   readonly #ui: Ui;
   readonly #input: Input;
+  readonly #fullscreen: Fullscreen;
   #session: Session | null = null;
   #error: PlayerError | null = null;
   #file: Blob | null = null;
@@ -67,15 +51,14 @@ export class KpcPlayer extends Base implements Model {
   #muted: boolean | null = null;
   #keepsLimits = true;
   #hasPlayed = false;
-  #plays: { resolve(): void; reject(error: unknown): void }[] = [];
+  readonly #plays = new PlayPromises();
   /** Where to begin, and from where to look, before that can be done. */
   #startTime: number | null = null;
   #startView: string | null = null;
   #resumed: Resumed | null = null;
   #readyState = 0;
   #progressAt = 0;
-  #pageAt = 0;
-  #isWhole = false;
+  readonly #scroll = new PageScroll();
 
   constructor() {
     super();
@@ -93,18 +76,15 @@ export class KpcPlayer extends Base implements Model {
       view: () => this.#session?.view ?? null,
       extent: () => this.#session?.extent ?? 1,
       isEnabled: () => this.cameraControls,
-      takesWheel: () => this.#isWhole || this.shadowRoot?.activeElement !== null,
+      takesWheel: () => this.#scroll.isNone || this.shadowRoot?.activeElement !== null,
       moved: () => {
         this.#ui.endHint();
         this.#session?.wake();
       },
-      clicked: (event) => this.#clicked(event),
+      clicked: (event) => this.#ui.click(event),
       commands: this.#commands,
     });
-    this.addEventListener('fullscreenchange', () => this.#refresh());
-    this.#ui.player.addEventListener('keydown', (event) => {
-      if (event.key === 'Escape' && !event.defaultPrevented) this.#fillWindow(false);
-    });
+    this.#fullscreen = new Fullscreen(this, () => this.#refresh());
     this.#ui.setTitle('');
   }
 
@@ -142,16 +122,7 @@ export class KpcPlayer extends Base implements Model {
     this.#refresh();
   }
 
-  // --- attributes
-
-  get src(): string {
-    const value = this.getAttribute('src');
-    return value === null ? '' : new URL(value, document.baseURI).href;
-  }
-
-  set src(value: string) {
-    set(this, 'src', value);
-  }
+  // --- playing
 
   /** A file that the page has, in place of `src`. */
   get srcObject(): Blob | null {
@@ -162,107 +133,6 @@ export class KpcPlayer extends Base implements Model {
     this.#file = file;
     if (this.isConnected) this.load();
   }
-
-  get poster(): string {
-    return string(this, 'poster');
-  }
-
-  set poster(value: string) {
-    set(this, 'poster', value);
-  }
-
-  get controls(): boolean {
-    return this.hasAttribute('controls');
-  }
-
-  set controls(value: boolean) {
-    set(this, 'controls', value);
-  }
-
-  get autoplay(): boolean {
-    return this.hasAttribute('autoplay');
-  }
-
-  set autoplay(value: boolean) {
-    set(this, 'autoplay', value);
-  }
-
-  get loop(): boolean {
-    return this.hasAttribute('loop');
-  }
-
-  set loop(value: boolean) {
-    set(this, 'loop', value);
-  }
-
-  get playsInline(): boolean {
-    return this.hasAttribute('playsinline');
-  }
-
-  set playsInline(value: boolean) {
-    set(this, 'playsinline', value);
-  }
-
-  get preload(): string {
-    return word(this, 'preload', ['auto', 'metadata', 'none']);
-  }
-
-  set preload(value: string) {
-    set(this, 'preload', value);
-  }
-
-  /** Whether hands may move the view: with `controls`, unless `camera-controls` is "none". */
-  get cameraControls(): boolean {
-    return string(this, 'camera-controls', this.controls ? '' : 'none').toLowerCase() !== 'none';
-  }
-
-  set cameraControls(value: boolean) {
-    set(this, 'camera-controls', value ? '' : 'none');
-  }
-
-  get quality(): Level | 'auto' {
-    return word(this, 'quality', ['auto', ...LEVEL_NAMES]);
-  }
-
-  set quality(value: string) {
-    set(this, 'quality', value);
-  }
-
-  /** Frames a second that `quality="auto"` holds; 0 for what suits the device. */
-  get targetFps(): number {
-    return positive(this, 'target-fps', 0);
-  }
-
-  set targetFps(value: number) {
-    set(this, 'target-fps', value);
-  }
-
-  /** What the attribute `part` says; the property of that name is every element's list of tokens. */
-  get shownPart(): ShownPart {
-    return word(this, 'part', ['all', 'static', 'dynamic']);
-  }
-
-  set shownPart(value: string) {
-    set(this, 'part', value);
-  }
-
-  get appearance(): string {
-    return string(this, 'appearance');
-  }
-
-  set appearance(value: string) {
-    set(this, 'appearance', value);
-  }
-
-  get memory(): number {
-    return positive(this, 'memory', DEFAULT_MEMORY);
-  }
-
-  set memory(value: number) {
-    set(this, 'memory', value);
-  }
-
-  // --- playing
 
   get currentTime(): number {
     return this.#session?.clip ? this.#clock.time : (this.#startTime ?? 0);
@@ -326,12 +196,7 @@ export class KpcPlayer extends Base implements Model {
   }
 
   get buffered(): PlayerRanges {
-    const ranges = this.#session?.clip?.buffered ?? [];
-    const bound = (index: number, end: 0 | 1) => {
-      if (!(index in ranges)) throw new DOMException(`there is no range ${index}`, 'IndexSizeError');
-      return ranges[index][end];
-    };
-    return { length: ranges.length, start: (index) => bound(index, 0), end: (index) => bound(index, 1) };
+    return rangesOf(this.#session?.clip?.buffered ?? []);
   }
 
   get readyState(): number {
@@ -345,13 +210,13 @@ export class KpcPlayer extends Base implements Model {
   /** Play; resolves when the clip moves, or at once if nothing in it does. */
   play(): Promise<void> {
     if (this.#error) return Promise.reject(new DOMException(this.#error.message, 'NotSupportedError'));
-    const promise = new Promise<void>((resolve, reject) => this.#plays.push({ resolve, reject }));
+    const promise = this.#plays.add();
     this.#hasPlayed = true;
     this.#clock.play();
     if (this.#session === null && this.isConnected) this.#start(true);
     this.#fetch();
     if (this.duration === 0) this.#clock.pause();
-    else if (!this.#clock.isWaiting) this.#settlePlays();
+    else if (!this.#clock.isWaiting) this.#plays.settle();
     return promise;
   }
 
@@ -395,7 +260,7 @@ export class KpcPlayer extends Base implements Model {
       this.#startView = text;
       return;
     }
-    const view = this.#viewOf(text);
+    const view = session.viewOf(text);
     if (view === null) console.warn(`kpc-player: there is no camera "${text}"`);
     else session.view.lookFrom(view);
     session.wake();
@@ -406,16 +271,11 @@ export class KpcPlayer extends Base implements Model {
   }
 
   get cameras(): readonly string[] {
-    const { cameras = [], metadata = {} } = this.#session?.clip ?? {};
-    return cameras.map((_, number) => metadata.camera_names?.[number] ?? `camera ${number + 1}`);
+    return this.#session?.cameraNames ?? [];
   }
 
   get appearances(): readonly string[] {
     return (this.#session?.clip?.scenes[0].appearances ?? []).map(({ name }) => name);
-  }
-
-  get levels(): readonly string[] {
-    return LEVEL_NAMES;
   }
 
   get isDynamic(): boolean {
@@ -443,27 +303,18 @@ export class KpcPlayer extends Base implements Model {
     return this.#session?.clip?.metadata ?? {};
   }
 
-  /** The file's name without its suffix, for files that are saved. */
-  get fileStem(): string {
-    const name = this.#file ? ((this.#file as File).name ?? '') : new URL(this.src || 'about:scene').pathname;
-    return (name.split('/').pop() ?? '').replace(/\.kpc$/i, '') || 'scene';
-  }
-
   /** Return what is shown as a picture file; a paused picture is drawn as finely as it will be first. */
   async toBlob(type = 'image/png', quality?: number): Promise<Blob> {
     if (!this.#session) throw new DOMException('there is no picture yet', 'InvalidStateError');
     return this.#session.toBlob(type, quality);
   }
 
-  override async requestFullscreen(options?: FullscreenOptions): Promise<void> {
-    if (document.fullscreenEnabled) await super.requestFullscreen(options);
-    else this.#fillWindow(true);
+  override requestFullscreen(options?: FullscreenOptions): Promise<void> {
+    return this.#fullscreen.request(() => super.requestFullscreen(options));
   }
 
   toggleFullscreen(): void {
-    if (this.matches(':fullscreen')) document.exitFullscreen();
-    else if (this.hasAttribute('data-fills-window')) this.#fillWindow(false);
-    else this.requestFullscreen().catch(() => this.#fillWindow(true));
+    this.#fullscreen.toggle();
   }
 
   // --- inside
@@ -509,7 +360,7 @@ export class KpcPlayer extends Base implements Model {
     this.#session = null;
     this.#error = null;
     this.#readyState = 0;
-    this.#settlePlays(new DOMException('loading was ended', 'AbortError'));
+    this.#plays.settle(new DOMException('loading was ended', 'AbortError'));
     this.#clock.reset();
     this.#ui.rest();
     this.#ui.showError(null);
@@ -563,27 +414,17 @@ export class KpcPlayer extends Base implements Model {
     if (error.code === 'aborted') return;
     this.#error = error;
     this.#clock.pause();
-    this.#settlePlays(new DOMException(error.message, 'NotSupportedError'));
+    this.#plays.settle(new DOMException(error.message, 'NotSupportedError'));
     this.#ui.showError(error);
     this.#refresh();
     this.#emit('error');
   }
 
   #clocked(event: ClockEvent): void {
-    if (event === 'playing') this.#settlePlays();
+    if (event === 'playing') this.#plays.settle();
     if (event === 'pause')
-      this.#settlePlays(this.duration === 0 ? undefined : new DOMException('paused', 'AbortError'));
+      this.#plays.settle(this.duration === 0 ? undefined : new DOMException('paused', 'AbortError'));
     this.#emit(event);
-  }
-
-  /** Resolve the promises of `play`, or reject them with an error. */
-  #settlePlays(error?: DOMException): void {
-    const plays = this.#plays;
-    this.#plays = [];
-    for (const { resolve, reject } of plays) {
-      if (error) reject(error);
-      else resolve();
-    }
   }
 
   /** Fetch what the playhead needs from now on, whatever `preload` says. */
@@ -591,16 +432,6 @@ export class KpcPlayer extends Base implements Model {
     if (!this.#session) return;
     this.#session.fetches = true;
     this.#session.wake();
-  }
-
-  /** Return the view that a name or numbers say; null if they say none. */
-  #viewOf(text: string): View | null {
-    const { clip, view, presets } = this.#session as Session;
-    if (clip === null || view === null) return null;
-    const { rig } = view;
-    const opening = clip.metadata.opening?.camera ?? rig.cameras[0];
-    const named = text === 'opening' ? opening : (presets.get(text) ?? clip.cameras[this.cameras.indexOf(text)]);
-    return named ? viewOf(rig, named) : viewFromText(rig, text, opening);
   }
 
   get #isFirst(): boolean {
@@ -613,31 +444,11 @@ export class KpcPlayer extends Base implements Model {
     if (moment?.camera != null) this.camera = moment.camera;
   };
 
-  /** A click plays or pauses, and a second one fills the screen; a touch shows the bar of a clip that plays. */
-  #clicked(event: PointerEvent): void {
-    if (!this.controls || this.#error) return;
-    const wasIdle = this.#ui.isIdle;
-    this.#ui.stir();
-    if (event.pointerType === 'mouse') this.#commands.playOrPause();
-    else if (!wasIdle && this.paused) this.#commands.playOrPause();
-  }
-
-  #fillWindow(fills: boolean): void {
-    set(this, 'data-fills-window', fills);
-    this.#refresh();
-  }
-
   /** Show the present state around the picture, and say what has changed. */
   #refresh(): void {
     const session = this.#session;
     const clock = this.#clock;
-    const now = performance.now();
-    const isFullscreen = this.matches(':fullscreen') || this.hasAttribute('data-fills-window');
-    if (now - this.#pageAt > PAGE_MS) {
-      this.#pageAt = now;
-      const page = document.scrollingElement;
-      this.#isWhole = page !== null && page.scrollHeight <= page.clientHeight;
-    }
+    const isFullscreen = this.#fullscreen.isOn;
     const { readyState } = this;
     if (readyState >= HAVE_FUTURE_DATA && this.#readyState < HAVE_FUTURE_DATA) this.#emit('canplay');
     this.#readyState = readyState;
@@ -656,7 +467,7 @@ export class KpcPlayer extends Base implements Model {
       duration,
       buffered: session?.clip?.buffered ?? [],
       isFullscreen,
-      isWhole: this.#isWhole || isFullscreen,
+      isWhole: this.#scroll.isNone || isFullscreen,
     });
     session?.wakeIfChanged(`${this.quality} ${this.shownPart} ${this.appearance}`);
   }

@@ -105,7 +105,7 @@ export class PlayerCommands implements Commands {
     const player = this.#player;
     try {
       const address = URL.createObjectURL(await player.toBlob());
-      make('a', { href: address, download: `${player.fileStem}-${player.currentTime.toFixed(2)}s.png` }).click();
+      make('a', { href: address, download: `${fileStem(player)}-${player.currentTime.toFixed(2)}s.png` }).click();
       setTimeout(() => URL.revokeObjectURL(address), 60_000);
     } catch (error) {
       this.#ui().notify((error as Error).message);
@@ -148,4 +148,10 @@ export class PlayerCommands implements Commands {
     this.#player.camera = name;
     this.#ui().notify(name);
   }
+}
+
+/** Return the name of a player's file without its suffix. */
+function fileStem({ srcObject, src }: KpcPlayer): string {
+  const name = srcObject ? ((srcObject as File).name ?? '') : new URL(src || 'about:scene').pathname;
+  return (name.split('/').pop() ?? '').replace(/\.kpc$/i, '') || 'scene';
 }

@@ -4,7 +4,7 @@ import type { SceneEvent } from '../streaming/clip.js';
 import { Clip } from '../streaming/clip.js';
 import { Limits } from './camera/limits.js';
 import { Rig } from './camera/rig.js';
-import { cameraOf, type View } from './camera/view.js';
+import { cameraOf, type View, viewFromText, viewOf } from './camera/view.js';
 import { ViewControl } from './camera/view_control.js';
 import type { Clock } from './clock.js';
 import { loadDriver } from './driver.js';
@@ -118,6 +118,21 @@ export class Session {
 
   get isDynamic(): boolean {
     return this.clip?.scenes[0].head.isDynamic ?? false;
+  }
+
+  get cameraNames(): readonly string[] {
+    const { cameras = [], metadata = {} } = this.clip ?? {};
+    return cameras.map((_, number) => metadata.camera_names?.[number] ?? `camera ${number + 1}`);
+  }
+
+  /** Return the view that the name of a preset or a camera, "opening", or numbers say; null if they say none. */
+  viewOf(text: string): View | null {
+    const { clip, view, presets } = this;
+    if (clip === null || view === null) return null;
+    const { rig } = view;
+    const opening = clip.metadata.opening?.camera ?? rig.cameras[0];
+    const named = text === 'opening' ? opening : (presets.get(text) ?? clip.cameras[this.cameraNames.indexOf(text)]);
+    return named ? viewOf(rig, named) : viewFromText(rig, text, opening);
   }
 
   /** How much is there, as of HTMLMediaElement. */

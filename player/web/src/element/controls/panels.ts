@@ -1,5 +1,6 @@
 /** What the panels of the bar hold: views to choose from, and settings. */
 
+import { LEVEL_NAMES } from '../../render/quality.js';
 import { SPEEDS } from '../clock.js';
 import type { Commands } from '../commands.js';
 import { KEY_BINDINGS } from '../keyboard.js';
@@ -10,7 +11,6 @@ export interface Model {
   readonly presets: readonly string[];
   readonly cameras: readonly string[];
   readonly appearances: readonly string[];
-  readonly levels: readonly string[];
   readonly duration: number;
   readonly isDynamic: boolean;
   readonly hasLimits: boolean;
@@ -56,7 +56,7 @@ export function fillSettings(panel: HTMLElement, model: Model, commands: Command
       }),
     );
   }
-  const levels = new Map(['auto', ...model.levels].map((level) => [level, capital(level)]));
+  const levels = new Map(['auto', ...LEVEL_NAMES].map((level) => [level, capital(level)]));
   rows.push(
     select('Quality', levels, model.quality, (value) => {
       model.quality = value;

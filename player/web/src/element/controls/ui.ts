@@ -196,14 +196,12 @@ export class Ui {
     return isOpen;
   }
 
-  /** Whether the bar is hidden for the moment. */
-  get isIdle(): boolean {
-    return this.player.classList.contains('idle');
-  }
-
-  /** Show the bar, and hide it after a while if the clip plays. */
-  stir(): void {
+  /** A click on the picture plays or pauses; a touch first shows the bar of a clip that plays. */
+  click({ pointerType }: PointerEvent): void {
+    if (this.#bar.hidden || !this.#error.hidden) return;
+    const wasIdle = this.player.classList.contains('idle');
     this.#stirred();
+    if (pointerType === 'mouse' || (!wasIdle && !this.#isPlaying)) this.#actions.commands.playOrPause();
   }
 
   /** End all timers. */

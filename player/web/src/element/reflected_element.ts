@@ -1,0 +1,118 @@
+/** The attributes of `<kpc-player>` that properties reflect; docs/web.md says what they mean. */
+
+import type { ShownPart } from '../render/picture_job.js';
+import { LEVEL_NAMES, type Level } from '../render/quality.js';
+import { DEFAULT_MEMORY } from '../streaming/clip.js';
+import { positive, set, string, word } from './attributes.js';
+
+const Base = (globalThis.HTMLElement ?? class {}) as typeof HTMLElement; // servers that render pages have none
+
+export class ReflectedElement extends Base {
+  get src(): string {
+    const value = this.getAttribute('src');
+    return value === null ? '' : new URL(value, document.baseURI).href;
+  }
+
+  set src(value: string) {
+    set(this, 'src', value);
+  }
+
+  get poster(): string {
+    return string(this, 'poster');
+  }
+
+  set poster(value: string) {
+    set(this, 'poster', value);
+  }
+
+  get controls(): boolean {
+    return this.hasAttribute('controls');
+  }
+
+  set controls(value: boolean) {
+    set(this, 'controls', value);
+  }
+
+  get autoplay(): boolean {
+    return this.hasAttribute('autoplay');
+  }
+
+  set autoplay(value: boolean) {
+    set(this, 'autoplay', value);
+  }
+
+  get loop(): boolean {
+    return this.hasAttribute('loop');
+  }
+
+  set loop(value: boolean) {
+    set(this, 'loop', value);
+  }
+
+  get playsInline(): boolean {
+    return this.hasAttribute('playsinline');
+  }
+
+  set playsInline(value: boolean) {
+    set(this, 'playsinline', value);
+  }
+
+  get preload(): string {
+    return word(this, 'preload', ['auto', 'metadata', 'none']);
+  }
+
+  set preload(value: string) {
+    set(this, 'preload', value);
+  }
+
+  /** Whether hands may move the view: with `controls`, unless `camera-controls` is "none". */
+  get cameraControls(): boolean {
+    return string(this, 'camera-controls', this.controls ? '' : 'none').toLowerCase() !== 'none';
+  }
+
+  set cameraControls(value: boolean) {
+    set(this, 'camera-controls', value ? '' : 'none');
+  }
+
+  get quality(): Level | 'auto' {
+    return word(this, 'quality', ['auto', ...LEVEL_NAMES]);
+  }
+
+  set quality(value: string) {
+    set(this, 'quality', value);
+  }
+
+  /** Frames a second that `quality="auto"` holds; 0 for what suits the device. */
+  get targetFps(): number {
+    return positive(this, 'target-fps', 0);
+  }
+
+  set targetFps(value: number) {
+    set(this, 'target-fps', value);
+  }
+
+  /** What the attribute `part` says; the property of that name is every element's list of tokens. */
+  get shownPart(): ShownPart {
+    return word(this, 'part', ['all', 'static', 'dynamic']);
+  }
+
+  set shownPart(value: string) {
+    set(this, 'part', value);
+  }
+
+  get appearance(): string {
+    return string(this, 'appearance');
+  }
+
+  set appearance(value: string) {
+    set(this, 'appearance', value);
+  }
+
+  get memory(): number {
+    return positive(this, 'memory', DEFAULT_MEMORY);
+  }
+
+  set memory(value: number) {
+    set(this, 'memory', value);
+  }
+}
