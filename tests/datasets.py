@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kpc.encoder.datasets import Dataset, load_dataset, pixel_rays
+from kpc.encoder.datasets import Dataset, Pictures, load_dataset, pixel_rays
 from kpc.format.common.errors import DatasetError, KpcError, MediaError
 from kpc.format.common.films import write_video
 from kpc.format.common.images import write_image
+from kpc.format.scene.camera_models import COLMAP_NUMBERS, PARAMETERS
 from kpc.format.scene.cameras import Camera
 
 # Frame rate of the videos.
@@ -166,7 +167,7 @@ def write_varying_exposure(folder: Path, images: int = 32, own_lens: bool = True
 
 
 # Camera models by name, with their numbers in binary files.
-COLMAP_MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+COLMAP_MODELS = {name: number for number, name in COLMAP_NUMBERS.items()}
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
@@ -234,7 +235,7 @@ def write_colmap(
     for k, camera in enumerate(rig):
         write_image(folder / "images" / f"{k:04d}.png", picture(camera))
     c = rig[0]
-    focal = (c.fl_x, c.fl_y) if model in ("PINHOLE", "OPENCV") else (c.fl_x,)
+    focal = (c.fl_x, c.fl_y) if PARAMETERS.get(model, "fx").startswith("fx") else (c.fl_x,)
     camera = (7, model, c.width, c.height, (*focal, c.cx, c.cy, *lens))
     posed = [(images - k, colmap_pose(c.camera_to_world), 7, f"{k:04d}.png", k % 3) for k, c in enumerate(rig)]
     write_colmap_model(folder / "sparse" / "0", [camera], posed, binary)
@@ -272,6 +273,28 @@ def fails(folder: Path, *words: str, **options: object) -> None:
     assert "\n" not in message and all(word in message for word in words), message
 
 
+def pictures_of(
+    cameras: list[Camera], near: float = np.nan, far: float = np.nan, tests: tuple[int, ...] = ()
+) -> Pictures:
+    """Return the pictures of pinhole cameras, without files."""
+    n = len(cameras)
+    return Pictures(
+        file=tuple(f"{k}.png" for k in range(n)),
+        camera=np.arange(n, dtype=np.int32),
+        time=np.zeros(n, np.float32),
+        is_test=np.isin(np.arange(n), tests),
+        offset=np.zeros(n, np.int64),
+        width=np.array([c.width for c in cameras], np.int32),
+        height=np.array([c.height for c in cameras], np.int32),
+        intrinsics=np.array([[c.fl_x, c.fl_y, c.cx, c.cy] for c in cameras]),
+        distortion=np.zeros((n, 8)),
+        is_fisheye=np.zeros(n, bool),
+        camera_to_world=np.stack([c.camera_to_world for c in cameras]),
+        near=np.full(n, near, np.float32),
+        far=np.full(n, far, np.float32),
+    )
+
+
 def all_rays(dataset: Dataset, picture: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the rays of all pixels of a picture."""
     camera = dataset.camera(picture)
@@ -279,9 +302,22 @@ def all_rays(dataset: Dataset, picture: int) -> tuple[np.ndarray, np.ndarray]:
     return pixel_rays(dataset.pictures, np.full(len(row), picture), column, row)
 
 
-def distorted(x: np.ndarray, y: np.ndarray, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Apply OpenCV's lens distortion, with (N, 4) coefficients k1 k2 p1 p2, to (N,) normalised coordinates."""
-    k1, k2, p1, p2 = coefficients.T
+def distorted(
+    x: np.ndarray, y: np.ndarray, coefficients: np.ndarray, fisheye: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Project slopes through a lens as OpenCV documents it.
+
+    Args:
+        x, y: (N,) slopes, y down.
+        coefficients: (N or 1, 4 to 8) k1 k2 p1 p2 k3 k4 k5 k6, or (N or 1, 4) k1 k2 k3 k4 of a fisheye lens.
+    """
+    if fisheye:
+        k1, k2, k3, k4 = coefficients.T
+        slope = np.hypot(x, y)
+        a = np.arctan(slope)
+        share = (a + k1 * a**3 + k2 * a**5 + k3 * a**7 + k4 * a**9) / np.maximum(slope, 1e-12)
+        return x * share, y * share
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients, ((0, 0), (0, 8 - coefficients.shape[1]))).T
     r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2**2
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
     return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y

@@ -109,7 +109,13 @@ def hash_dataset(dataset: Dataset) -> str:
         with (dataset.path / name).open("rb") as opened:
             digest.update(name.encode(errors="surrogateescape") + b"\0")
             digest.update(hashlib.file_digest(opened, "sha256").digest())
-    for numbers in (pictures.camera_to_world, pictures.intrinsics, pictures.distortion, pictures.time):
+    for numbers in (
+        pictures.camera_to_world,
+        pictures.intrinsics,
+        pictures.distortion,
+        pictures.is_fisheye,
+        pictures.time,
+    ):
         digest.update(np.ascontiguousarray(numbers, "<f8").tobytes())
     return digest.hexdigest()
 

@@ -16,7 +16,7 @@ from kpc.encoder.datasets.video import VideoInfo
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
 from kpc.format.common.media_files import IMAGE_SUFFIXES
-from kpc.format.scene.camera_checks import check_depths, check_lens, check_pose
+from kpc.format.scene.camera_checks import NO_DISTORTION, Distortion, check_depths, check_lens, check_pose
 
 # Where neither the dataset nor the user names test images, every eighth is one, as in LLFF (arXiv:1905.00889).
 HOLD_OUT_EVERY = 8
@@ -36,6 +36,23 @@ class MaskFile:
 
 
 @dataclass(frozen=True)
+class Lens:
+    """The lens of a camera as a calibration has it, not checked.
+
+    Attributes:
+        size: width and height of the pictures for which it holds; None if those are the pictures as stored.
+        intrinsics: fl_x fl_y cx cy in pixels of that size, the centre of the first pixel at 0.5.
+        distortion: the coefficients DISTORTION_KEYS of OpenCV's lens models.
+        is_fisheye: whether they are those of its fisheye model.
+    """
+
+    size: tuple[float, float] | None
+    intrinsics: tuple[float, float, float, float]
+    distortion: Distortion = NO_DISTORTION
+    is_fisheye: bool = False
+
+
+@dataclass(frozen=True)
 class CapturedView:
     """One file of a dataset, with the camera that captured it.
 
@@ -46,12 +63,13 @@ class CapturedView:
         is_test: whether it is held out from training.
         width, height, has_alpha: of the picture, before downscaling.
         intrinsics: fl_x fl_y cx cy in pixels of that size.
-        distortion: k1 k2 p1 p2 of OpenCV's lens model.
+        distortion: the coefficients DISTORTION_KEYS of OpenCV's lens models.
         camera_to_world: (4, 4) float64, OpenGL convention.
         near, far: depth range along the optical axis, NaN if unknown.
         orientation: of an image, EXIF's number from 1 (as stored) to 8.
         upright: whether that orientation is applied.
         mask: the mask that the dataset's own files name; None if they name none.
+        is_fisheye: whether `distortion` is that of OpenCV's fisheye model.
     """
 
     file: Path
@@ -62,13 +80,14 @@ class CapturedView:
     height: int
     has_alpha: bool
     intrinsics: tuple[float, float, float, float]
-    distortion: tuple[float, float, float, float]
+    distortion: Distortion
     camera_to_world: np.ndarray
     near: float = math.nan
     far: float = math.nan
     orientation: int = 1
     upright: bool = False
     mask: MaskFile | None = None
+    is_fisheye: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,16 +111,14 @@ class Capture:
 
 def image_view(
     file: Path,
-    *,
     where: str,
+    lens: Lens,
+    camera_to_world: np.ndarray,
+    *,
     time: float | None,
     is_test: bool,
-    declared: tuple[float, float] | None,
-    intrinsics: tuple[float, float, float, float],
-    distortion: tuple[float, float, float, float],
-    camera_to_world: np.ndarray,
-    near: float,
-    far: float,
+    near: float = math.nan,
+    far: float = math.nan,
 ) -> CapturedView:
     """Return the view of an image.
 
@@ -110,17 +127,15 @@ def image_view(
     Args:
         file: the image.
         where: the calibration's file and entry, for messages.
-        declared: the image size of the calibration; None if it is that of the image as stored.
-        time, is_test, intrinsics, distortion, camera_to_world, near, far: as in `CapturedView`, but `intrinsics` for
-            the declared size, and none of them checked.
+        lens, camera_to_world, time, is_test, near, far: as in `CapturedView`, but none of them checked.
     """
     info = image_info(file)
     width, height = info.width, info.height
-    upright = declared is not None and _fits(declared, info.displayed_size) and not _fits(declared, (width, height))
+    upright = lens.size is not None and _fits(lens.size, info.displayed_size) and not _fits(lens.size, (width, height))
     if upright:
         width, height = info.displayed_size
-    intrinsics = fit_intrinsics(where, file, intrinsics, declared or (width, height), (width, height))
-    check_lens(where, (width, height), intrinsics, distortion)
+    intrinsics = fit_intrinsics(where, file, lens.intrinsics, lens.size or (width, height), (width, height))
+    check_lens(where, (width, height), intrinsics, lens.distortion, lens.is_fisheye)
     check_depths(where, near, far)
     return CapturedView(
         file,
@@ -131,12 +146,13 @@ def image_view(
         height,
         info.has_alpha,
         intrinsics,
-        distortion,
+        lens.distortion,
         check_pose(where, camera_to_world),
         near,
         far,
         info.orientation,
         upright,
+        is_fisheye=lens.is_fisheye,
     )
 
 

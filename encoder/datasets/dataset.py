@@ -33,7 +33,8 @@ class Pictures:
         offset: (P,) int64, index of the first pixel in the cache.
         width, height: (P,) int32, size in the cache, that is after downscaling.
         intrinsics: (P, 4) float64, fl_x fl_y cx cy in pixels of that size.
-        distortion: (P, 4) float64, k1 k2 p1 p2 of OpenCV's lens model.
+        distortion: (P, 8) float64, the coefficients DISTORTION_KEYS of OpenCV's lens models.
+        is_fisheye: (P,) bool, whether they are those of its fisheye model.
         camera_to_world: (P, 4, 4) float64, OpenGL convention.
         near, far: (P,) float32, depth along the optical axis, NaN if unknown.
     """
@@ -47,6 +48,7 @@ class Pictures:
     height: np.ndarray
     intrinsics: np.ndarray
     distortion: np.ndarray
+    is_fisheye: np.ndarray
     camera_to_world: np.ndarray
     near: np.ndarray
     far: np.ndarray
@@ -65,7 +67,7 @@ class Dataset:
     """A dataset for training, as `load_dataset` returns it.
 
     Attributes:
-        layout: "N3DV", "LLFF", "Blender", "nerfstudio" or "COLMAP".
+        layout: "N3DV", "LLFF", or the NAME of another module in `layouts`.
         path: its folder.
         pictures: cameras, times and sizes of all pictures.
         pixels: the decoded pictures.
@@ -164,8 +166,8 @@ class Dataset:
         aspect = p.intrinsics[:, 1] / p.intrinsics[:, 0]
         if np.abs(aspect - 1).max() > SQUARE_PIXELS:
             parts.append(f"fl_y / fl_x {aspect[np.abs(aspect - 1).argmax()]:.4g}")
-        if p.distortion.any():
-            parts.append("distortion")
+        if p.distortion.any() or p.is_fisheye.any():
+            parts.append("fisheye" if p.is_fisheye.any() else "distortion")
         if self.masks is not None:
             area = (p.width.astype(np.int64) * p.height).sum()
             parts.append(f"masks ({1 - self.usable_counts.sum() / area:.1%} ignored)")

@@ -134,9 +134,12 @@ def _load(
     masks = load_masks(root, views, mask_files, cache_dir / f"pixels-{key}-masks.bin", downscale, progress)
     intrinsics = np.array([v.intrinsics for v in views])[view_of] / downscale
     distortion = np.array([v.distortion for v in views])[view_of]
+    is_fisheye = np.array([v.is_fisheye for v in views])[view_of]
     poses = np.stack([v.camera_to_world for v in views])[view_of]
     files = tuple(valid_unicode(views[v].file.relative_to(root).as_posix()) for v in view_of)
-    camera, first = _distinct(np.concatenate([poses.reshape(-1, 16), intrinsics, distortion], axis=1))
+    camera, first = _distinct(
+        np.concatenate([poses.reshape(-1, 16), intrinsics, distortion, is_fisheye[:, None]], axis=1)
+    )
     pictures = Pictures(
         file=files,
         camera=camera,
@@ -147,6 +150,7 @@ def _load(
         height=np.array([t.height for t in cache.tiles], np.int32),
         intrinsics=intrinsics,
         distortion=distortion,
+        is_fisheye=is_fisheye,
         camera_to_world=poses,
         near=np.array([v.near for v in views], np.float32)[view_of],
         far=np.array([v.far for v in views], np.float32)[view_of],

@@ -4,6 +4,7 @@ import numpy as np
 from numba import njit, prange
 
 from kpc.encoder.datasets import Pictures
+from kpc.encoder.datasets.rays import covering_pinholes
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping, uncontract
 
@@ -26,8 +27,9 @@ def find_box(pictures: Pictures, has_alpha: bool) -> np.ndarray:
         DatasetError: neither is the case.
     """
     cameras = _distinct_cameras(pictures)
+    pinholes = covering_pinholes(pictures)
     if _near_and_far_known(pictures, cameras):
-        corners = np.concatenate([_frustum(pictures, p) for p in cameras])
+        corners = np.concatenate([_frustum(pictures, p, pinholes[p]) for p in cameras])
         return np.stack([corners.min(0), corners.max(0)]).astype(np.float32)
     focus = _focus(pictures, cameras)
     if focus is None:
@@ -36,10 +38,8 @@ def find_box(pictures: Pictures, has_alpha: bool) -> np.ndarray:
         )
     distance = np.linalg.norm(focus - pictures.camera_to_world[cameras, :3, 3], axis=1)
     if has_alpha:
-        size = np.maximum(
-            pictures.width[cameras] / pictures.intrinsics[cameras, 0],
-            pictures.height[cameras] / pictures.intrinsics[cameras, 1],
-        )
+        fl_x, fl_y = pinholes[cameras, :2].T
+        size = np.maximum(pictures.width[cameras] / fl_x, pictures.height[cameras] / fl_y)
         half = np.max(distance * np.sin(np.arctan(size / 2)))
     else:
         half = 2 * np.median(distance)
@@ -107,7 +107,8 @@ def fit_device_coordinates(pictures: Pictures) -> tuple[DeviceCoordinates, np.nd
     right = right / max(np.linalg.norm(right), 1e-9)
     middle = eyes.mean(0)
     eye = middle + back * ((eyes - middle) @ back).min()
-    corners = np.concatenate([_frustum(pictures, p) for p in cameras])
+    pinholes = covering_pinholes(pictures)
+    corners = np.concatenate([_frustum(pictures, p, pinholes[p]) for p in cameras])
     near, typical = float(((eye - corners) @ back).min()), float(np.median(pictures.near[cameras]))
     baseline = 2 * float(np.linalg.norm(eyes - middle, axis=1).max())
     if not (near > typical / 10 and baseline > 0):
@@ -149,7 +150,7 @@ def visible_cells(
     near = np.where(np.isfinite(pictures.near[cameras]), pictures.near[cameras], 0.0)
     clear = np.zeros(len(cameras)) if focus is None else CLEARANCE * np.linalg.norm(focus - poses[:, :, 3], axis=1)
     sizes = np.stack([pictures.width[cameras], pictures.height[cameras]], axis=1)
-    intrinsics = pictures.intrinsics[cameras].astype(np.float64)
+    intrinsics = covering_pinholes(pictures)[cameras]
     count, blocked = _views(centres.astype(np.float64), poses, intrinsics, sizes, 0.9 * near, clear)
     return ((count >= min(at_least, len(cameras))) & ~blocked).reshape(shape)
 
@@ -194,9 +195,9 @@ def _near_and_far_known(pictures: Pictures, cameras: np.ndarray) -> bool:
     return bool(np.all(np.isfinite(pictures.near[cameras])) and np.all(np.isfinite(pictures.far[cameras])))
 
 
-def _frustum(pictures: Pictures, p: int) -> np.ndarray:
+def _frustum(pictures: Pictures, p: int, pinhole: np.ndarray) -> np.ndarray:
     """Return the eight corners of a picture's frustum between near and far, (8, 3) world coordinates."""
-    fx, fy, cx, cy = pictures.intrinsics[p]
+    fx, fy, cx, cy = pinhole
     w, h = pictures.width[p], pictures.height[p]
     local = np.array(
         [

@@ -412,7 +412,7 @@ def _fingerprint(dataset: Dataset) -> str:
     """Return a hash of all that the rays of a run depend on, including checksums of pixels and masks."""
     digest = hashlib.sha256(repr([(tile.offset, tile.crc32c) for tile in dataset.pixels.tiles]).encode())
     p = dataset.pictures
-    for array in (p.time, p.is_test, p.width, p.height, p.intrinsics, p.distortion, p.camera_to_world):
+    for array in (p.time, p.is_test, p.width, p.height, p.intrinsics, p.distortion, p.is_fisheye, p.camera_to_world):
         digest.update(np.ascontiguousarray(array).tobytes())
     if dataset.masks is not None:
         digest.update(repr(dataset.masks.crc32c).encode())

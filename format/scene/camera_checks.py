@@ -6,13 +6,13 @@ same words. Each takes `where`, the file and entry that begin its message.
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from kpc.format.common.errors import DatasetError
-from kpc.format.scene.camera_models import HIGHER_ORDERS, NO_PINHOLE_KEYS, check_unknown_keys, understood_model
+from kpc.format.scene.camera_models import FISHEYE_MODELS, NO_PINHOLE_KEYS, check_unknown_keys, understood_model
 
 # Numbers of a camera lie within this magnitude: a .kpc file holds no larger ones (BOX_LIMIT of the specification).
 NUMBER_LIMIT = 2.0**30
@@ -35,14 +35,19 @@ GREATEST_STRETCH = 10.0
 # The picture counts as larger by this factor when folds are looked for, since only some directions are tried.
 SAFETY = 1.005
 
-# Coefficients of OpenCV's lens model that are understood.
-DISTORTION_KEYS = ("k1", "k2", "p1", "p2")
+# The largest angle from the optical axis that a picture of a fisheye lens may show, in radians.
+GREATEST_ANGLE = math.radians(170)
+
+# Coefficients of OpenCV's lens models, in its order. The fisheye model has no others than k1 to k4.
+DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+Distortion = tuple[float, ...]
+NO_DISTORTION: Distortion = (0.0,) * len(DISTORTION_KEYS)
 
 # Keys of a camera in a JSON document.
 _CAMERA_KEYS = frozenset(
     (
         *("w", "h", "fl_x", "fl_y", "cx", "cy", "transform_matrix", "time", "at", "camera_model", "camera_type"),
-        *(*DISTORTION_KEYS, *HIGHER_ORDERS, "distortion_params"),
+        *(*DISTORTION_KEYS, "distortion_params"),
     )
 )
 
@@ -106,7 +111,8 @@ def check_lens(
     where: str,
     size: tuple[float, float],
     intrinsics: tuple[float, float, float, float],
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+    distortion: Distortion = NO_DISTORTION,
+    is_fisheye: bool = False,
 ) -> None:
     """Check the lens of a camera.
 
@@ -114,7 +120,8 @@ def check_lens(
         where: as above.
         size: width and height of the picture.
         intrinsics: fl_x fl_y cx cy in pixels of that size.
-        distortion: k1 k2 p1 p2 of OpenCV's lens model.
+        distortion: the coefficients DISTORTION_KEYS.
+        is_fisheye: whether they are those of OpenCV's fisheye model.
 
     Raises:
         DatasetError: the picture is empty, a number is not finite, the focal length or principal point is not that of
@@ -146,11 +153,12 @@ def check_lens(
             f"{where}: the principal point {cx:g}, {cy:g} lies far outside a picture of {width:g}x{height:g}; "
             "give it in pixels of that size"
         )
-    if any(distortion) and _folds(size, intrinsics, distortion):
-        values = " ".join(f"{name} {value:g}" for name, value in zip(DISTORTION_KEYS, distortion, strict=True))
+    if (any(distortion) or is_fisheye) and _folds(size, intrinsics, distortion, is_fisheye):
+        values = " ".join(f"{name} {value:g}" for name, value in zip(DISTORTION_KEYS, distortion, strict=True) if value)
+        beyond = f", or shows more than {math.degrees(GREATEST_ANGLE):g} degrees from the axis" if is_fisheye else ""
         raise DatasetError(
-            f"{where}: distortion {values} folds within the picture or stretches it more than {GREATEST_STRETCH:g} "
-            "times, which no lens does; calibrate anew or undistort the images"
+            f"{where}: {'fisheye ' if is_fisheye else ''}distortion {values or 'of 0'} folds within the picture or "
+            f"stretches it more than {GREATEST_STRETCH:g} times{beyond}; calibrate anew or undistort the images"
         )
 
 
@@ -175,15 +183,17 @@ def check_pinhole(where: str, keys: Mapping[str, Any]) -> None:
         DatasetError: the document names another model, or coefficients of distortion that are not 0, or has the keys
             of a camera in other letters.
     """
-    check_unknown_keys(where, keys, _CAMERA_KEYS, _CAMERA_KEYS | {*NO_PINHOLE_KEYS, "file", "file_path"})
+    check_unknown_keys(where, keys, _CAMERA_KEYS, _CAMERA_KEYS | {*NO_PINHOLE_KEYS, "is_fisheye", "file", "file_path"})
     for key in ("camera_model", "camera_type"):
         if keys.get(key) is not None:
-            understood_model(where, ascii(str(keys[key]))[1:-1][:80])
-    for key in NO_PINHOLE_KEYS:
+            name = ascii(str(keys[key]))[1:-1][:80]
+            if understood_model(where, name) in FISHEYE_MODELS:
+                raise DatasetError(f"{where}: camera model {name} is not rendered; only pinholes are")
+    for key in ("is_fisheye", *NO_PINHOLE_KEYS):
         if keys.get(key):
             raise DatasetError(f"{where}: {key} is not supported; only pinholes are rendered")
     listed = keys.get("distortion_params") or []
-    coefficients = [number_of(where, keys, key, 0.0) for key in (*DISTORTION_KEYS, *HIGHER_ORDERS)]
+    coefficients = [number_of(where, keys, key, 0.0) for key in DISTORTION_KEYS]
     if any(coefficients) or not isinstance(listed, list) or any(number != 0 for number in listed):
         raise DatasetError(
             f"{where}: has lens distortion, which is not rendered; set its coefficients to 0 for pictures without it"
@@ -191,23 +201,35 @@ def check_pinhole(where: str, keys: Mapping[str, Any]) -> None:
 
 
 def distort(
-    x: np.ndarray, y: np.ndarray, distortion: tuple[Any, ...]
+    x: np.ndarray, y: np.ndarray, distortion: Sequence[Any], is_fisheye: Any = False
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Apply OpenCV's lens distortion, and return its Jacobian.
 
-    x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2)
-    y_d = y (1 + k1 r^2 + k2 r^4) + p1 (r^2 + 2 y^2) + 2 p2 x y
+    x_d = x q + 2 p1 x y + p2 (r^2 + 2 x^2)
+    y_d = y q + p1 (r^2 + 2 y^2) + 2 p2 x y,  r^2 = x^2 + y^2
+
+    q = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6) in the rational model, where x and y are slopes;
+    q = 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8 in the fisheye model, where r is the angle from the optical axis
+    (Kannala and Brandt 2006).
+
+    Source: https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html and .../db/d58/group__calib3d__fisheye.html
 
     Args:
         x, y: coordinates normalised by focal length and principal point, y down.
-        distortion: k1 k2 p1 p2, numbers or arrays like x.
+        distortion: the coefficients DISTORTION_KEYS, numbers or arrays like x.
+        is_fisheye: whether the model is the fisheye model, a bool or an array like x.
 
     Returns:
         x_d and y_d, and the derivatives d x_d / d x, d y_d / d y, and d x_d / d y, which equals d y_d / d x.
     """
-    k1, k2, p1, p2 = distortion
+    k1, k2, p1, p2, k3, k4, k5, k6 = distortion
+    last, first = np.where(is_fisheye, k4, 0.0), np.where(is_fisheye, 0.0, k4)  # of numerator and denominator
     r2 = x * x + y * y
-    radial, slope = 1 + r2 * (k1 + r2 * k2), 2 * (k1 + 2 * k2 * r2)
+    above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * last))), 1 + r2 * (first + r2 * (k5 + r2 * k6))
+    above_slope = k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * last))  # by r^2
+    below_slope = first + r2 * (2 * k5 + r2 * 3 * k6)
+    radial = above / below
+    slope = 2 * (above_slope - radial * below_slope) / below
     return (
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
         y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
@@ -223,12 +245,14 @@ def distort(
 def _folds(
     size: tuple[float, float],
     intrinsics: tuple[float, float, float, float],
-    distortion: tuple[float, float, float, float],
+    distortion: Distortion,
+    is_fisheye: bool,
 ) -> bool:
     """Return whether distortion is not one-to-one within the picture, or stretches by more than GREATEST_STRETCH.
 
     Walks from the principal point outwards in many directions until the distorted point leaves the rectangle around
-    the picture and the principal point. On the way the Jacobian's determinant must stay positive.
+    the picture and the principal point. On the way the Jacobian's determinant must stay positive, and the angle of a
+    fisheye lens below GREATEST_ANGLE.
     """
     fl_x, fl_y, cx, cy = intrinsics
     left, right = SAFETY * min(-cx, 0.0) / fl_x, SAFETY * max(size[0] - cx, 0.0) / fl_x
@@ -238,10 +262,12 @@ def _folds(
     angles = np.concatenate([np.linspace(0, 2 * math.pi, 96, endpoint=False), near_corners])[:, None]
     reach = math.hypot(max(-left, right), max(-top, bottom))
     radius = reach * np.geomspace(1e-2, GREATEST_STRETCH, 400)
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows fails the comparisons below
-        x, y, (xx, yy, xy) = distort(radius * np.cos(angles), radius * np.sin(angles), distortion)
+    # What overflows fails the comparisons below.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        x, y, (xx, yy, xy) = distort(radius * np.cos(angles), radius * np.sin(angles), distortion, is_fisheye)
         stretch = np.hypot(x, y) / radius
         is_sound = (xx * yy - xy * xy > 0) & (1 / GREATEST_STRETCH <= stretch) & (stretch <= GREATEST_STRETCH)
+        is_sound &= (radius < GREATEST_ANGLE) | (not is_fisheye)
         is_outside = ~((left <= x) & (x <= right) & (top <= y) & (y <= bottom))
     leaves = np.argmax(is_outside, axis=1)  # the first radius beyond the rectangle
     before = np.arange(len(radius)) <= leaves[:, None]

@@ -1,6 +1,7 @@
 """The camera models of COLMAP and nerfstudio, by name: those that are understood, with their parameters.
 
-Understood is a pinhole with at most OpenCV's lens model k1 k2 p1 p2; whatever is not in `PARAMETERS` is refused.
+Understood are OpenCV's two models, the rational one k1 k2 p1 p2 k3 k4 k5 k6 of a pinhole and the fisheye model k1 k2 k3
+k4, and COLMAP's special cases of both. Whatever is not in `PARAMETERS` is refused.
 
 Sources: https://colmap.github.io/cameras.html, https://docs.nerf.studio/quickstart/data_conventions.html
 """
@@ -19,18 +20,23 @@ PARAMETERS = {
     "SIMPLE_RADIAL": "f cx cy k1",
     "RADIAL": "f cx cy k1 k2",
     "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",  # k3 to k6 must be 0
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "SIMPLE_FISHEYE": "f cx cy",
+    "FISHEYE": "fx fy cx cy",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }
+
+# Those of them that are special cases of OpenCV's fisheye model.
+FISHEYE_MODELS = frozenset(name for name in PARAMETERS if name.endswith("FISHEYE"))
 
 # Other names of understood models, in documents whose keys name the parameters.
 OTHER_NAMES = {"PERSPECTIVE": "PINHOLE"}
 
-# Coefficients of distortion that are not understood: they must be 0.
-HIGHER_ORDERS = ("k3", "k4", "k5", "k6")
-
-# Keys of documents by which a camera is no pinhole, unless their value is 0, false, null or empty.
+# Keys of documents by which a camera is neither of both, unless their value is 0, false, null or empty.
 NO_PINHOLE_KEYS = (
-    *("is_fisheye", "fisheye", "fisheye_crop_radius", "latlong", "equirectangular", "orthographic"),
+    *("fisheye", "fisheye_crop_radius", "latlong", "equirectangular", "orthographic"),
     *(f"ftheta_p{n}" for n in range(5)),
 )
 
@@ -62,16 +68,6 @@ def understood_model(where: str, name: str) -> str:
     if model not in PARAMETERS:
         raise DatasetError(f"{where}: camera model {name} is not supported; undistort the images to a pinhole")
     return model
-
-
-def check_higher_orders(where: str, distortion: dict[str, float]) -> None:
-    """Refuse distortion of higher order than k1 k2 p1 p2.
-
-    Raises:
-        DatasetError: k3, k4, k5 or k6 is not 0.
-    """
-    if any(distortion.get(name, 0.0) != 0 for name in HIGHER_ORDERS):
-        raise DatasetError(f"{where}: distortion beyond k1 k2 p1 p2 is not supported; undistort the images")
 
 
 def check_unknown_keys(where: str, keys: Mapping[str, Any], read: Set[str], understood: Set[str]) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import datasets as make
-from kpc.encoder.datasets import Pictures
+from datasets import pictures_of
 from kpc.encoder.field.bounds import (
     CLEARANCE,
     CONTRACTION_BOX,
@@ -20,26 +20,6 @@ from kpc.encoder.field.bounds import (
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.space import Contraction, uncontract
-
-
-def pictures_of(
-    cameras: list[Camera], near: float = np.nan, far: float = np.nan, tests: tuple[int, ...] = ()
-) -> Pictures:
-    n = len(cameras)
-    return Pictures(
-        file=tuple(f"{k}.png" for k in range(n)),
-        camera=np.arange(n, dtype=np.int32),
-        time=np.zeros(n, np.float32),
-        is_test=np.isin(np.arange(n), tests),
-        offset=np.zeros(n, np.int64),
-        width=np.array([c.width for c in cameras], np.int32),
-        height=np.array([c.height for c in cameras], np.int32),
-        intrinsics=np.array([[c.fl_x, c.fl_y, c.cx, c.cy] for c in cameras]),
-        distortion=np.zeros((n, 4)),
-        camera_to_world=np.stack([c.camera_to_world for c in cameras]),
-        near=np.full(n, near, np.float32),
-        far=np.full(n, far, np.float32),
-    )
 
 
 def straight(x: float = 0.0, turned: bool = False) -> Camera:

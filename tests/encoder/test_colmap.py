@@ -48,6 +48,12 @@ def three(*names: str, pose: tuple[float, ...] = POSE) -> list[make.ColmapImage]
         ("SIMPLE_RADIAL", (0.06,), (0.06, 0, 0, 0)),
         ("RADIAL", (0.06, -0.08), (0.06, -0.08, 0, 0)),
         ("OPENCV", (0.06, -0.08, -0.001, 0.0002), (0.06, -0.08, -0.001, 0.0002)),
+        ("FULL_OPENCV", (0.1, 0.2, 1e-3, 2e-3, 0.3, 0.4, 0.5, 0.6), (0.1, 0.2, 1e-3, 2e-3, 0.3, 0.4, 0.5, 0.6)),
+        ("SIMPLE_FISHEYE", (), (0, 0, 0, 0)),
+        ("FISHEYE", (), (0, 0, 0, 0)),
+        ("SIMPLE_RADIAL_FISHEYE", (0.06,), (0.06, 0, 0, 0)),
+        ("RADIAL_FISHEYE", (0.06, -0.02), (0.06, -0.02, 0, 0)),
+        ("OPENCV_FISHEYE", (0.06, -0.02, 0.01, 0.002), (0.06, -0.02, 0, 0, 0.01, 0.002)),
     ],
 )
 def test_cameras_of_every_model_are_read(
@@ -64,10 +70,11 @@ def test_cameras_of_every_model_are_read(
         np.testing.assert_allclose(found.camera_to_world, camera.camera_to_world, atol=1e-12)
         assert (found.fl_x, found.fl_y, found.cx, found.cy) == (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
         np.testing.assert_array_equal(dataset.pixels.picture(n), make.picture(camera))
-    np.testing.assert_array_equal(p.distortion, np.tile(distortion, (10, 1)))
-    assert ("distortion" in dataset.describe()) == any(distortion) and dataset.describe().startswith(
-        "COLMAP: 10 cameras"
-    )
+    np.testing.assert_array_equal(p.distortion, np.tile((*distortion, *(8 - len(distortion)) * [0]), (10, 1)))
+    assert p.is_fisheye.tolist() == ["FISHEYE" in model] * 10
+    described = dataset.describe()
+    assert ("distortion" in described or "fisheye" in described) == any(distortion) or "FISHEYE" in model
+    assert described.startswith("COLMAP: 10 cameras")
 
 
 def test_rays_pass_through_points_projected_by_the_model(tmp_path: Path) -> None:
@@ -171,7 +178,11 @@ def test_missing_images_are_named_in_one_line(tmp_path: Path, capsys: pytest.Cap
 @pytest.mark.parametrize(
     "camera, words",
     [
-        ((1, "OPENCV_FISHEYE", 32, 24, (40.0, 40.0, 16.0, 12.0, 0.0, 0.0, 0.0, 0.0)), ("camera 1", "OPENCV_FISHEYE")),
+        (
+            (1, "OPENCV_FISHEYE", 32, 24, (40.0, 40.0, 16.0, 12.0, 0.0, 0.0, -99.0, 0.0)),
+            ("camera 1", "fisheye", "folds"),
+        ),
+        ((1, "FOV", 32, 24, (40.0, 40.0, 16.0, 12.0, 0.9)), ("camera 1", "FOV is not supported")),
         ((1, "PINHOLE", 32, 24, (40.0, np.nan, 16.0, 12.0)), ("camera 1", "NaN")),
         ((1, "OPENCV", 32, 24, (*PINHOLE, 0.0, np.inf, 0.0, 0.0)), ("camera 1", "NaN or infinity")),
         ((1, "PINHOLE", 32, 24, (40.0, -40.0, 16.0, 12.0)), ("camera 1", "must be positive")),

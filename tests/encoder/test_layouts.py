@@ -186,28 +186,37 @@ def test_a_frame_overrides_the_document_in_other_words(tmp_path: Path) -> None:
     p = load(nerfstudio(tmp_path / "set", change)).pictures
     np.testing.assert_allclose(p.intrinsics[1], [16 / math.tan(0.5), 38.4, 16, 12])
     np.testing.assert_allclose(p.intrinsics[2], [19.2, 19.2, 8, 6])
-    np.testing.assert_array_equal(p.distortion[:3], [[0.2, 0.1, 0, 0], [0.3, 0.1, 0, 0], [0.05, 0, 0.01, 0.02]])
+    np.testing.assert_array_equal(p.distortion[:3, :4], [[0.2, 0.1, 0, 0], [0.3, 0.1, 0, 0], [0.05, 0, 0.01, 0.02]])
 
 
-@pytest.mark.parametrize("model", ["perspective", "PINHOLE", "simple_radial", "OPENCV", "FULL_OPENCV", None])
+@pytest.mark.parametrize(
+    "model", ["perspective", "PINHOLE", "simple_radial", "OPENCV", "FULL_OPENCV", "fisheye", "OPENCV_FISHEYE", None]
+)
 def test_understood_camera_models(tmp_path: Path, model: str | None) -> None:
-    assert len(load(nerfstudio(tmp_path / "set", camera_model=model, k1=0.1, k3=0)).pictures) == 10
+    p = load(nerfstudio(tmp_path / "set", camera_model=model, k1=0.1, k3=0)).pictures
+    assert len(p) == 10 and p.is_fisheye.all() == p.is_fisheye.any() == ("FISHEYE" in (model or "").upper())
+
+
+def test_fisheye_of_instant_ngp(tmp_path: Path) -> None:
+    for keys in ({"is_fisheye": True}, {"is_fisheye": True, "camera_model": "OPENCV"}):
+        p = load(nerfstudio(tmp_path / "set", **keys, distortion_params=[0.1, 0.01, 2e-3, 3e-3, 0, 0])).pictures
+        assert p.is_fisheye.all() and p.distortion[0].tolist() == [0.1, 0.01, 0, 0, 2e-3, 3e-3, 0, 0]
 
 
 @pytest.mark.parametrize(
     "keys, words",
     [
-        ({"camera_model": "SIMPLE_RADIAL_FISHEYE"}, "SIMPLE_RADIAL_FISHEYE is not supported; undistort"),
+        ({"camera_model": "THIN_PRISM_FISHEYE"}, "THIN_PRISM_FISHEYE is not supported; undistort"),
         ({"camera_model": "VR180_L"}, "VR180_L is not supported"),
         ({"camera_model": "a model of 2031"}, "a model of 2031 is not supported"),
-        ({"camera_type": "fisheye"}, "fisheye is not supported"),
-        ({"is_fisheye": True}, "is_fisheye is not supported"),
+        ({"camera_type": "fisheye", "p1": 0.1}, "p1 of a camera model that is a fisheye"),
+        ({"is_fisheye": True, "camera_model": "PINHOLE"}, "is_fisheye contradicts camera model PINHOLE"),
         ({"latlong": True}, "latlong is not supported"),
         ({"ftheta_p1": 0.3}, "ftheta_p1 is not supported"),
         ({"from_na": True}, "from_na is not supported"),
-        ({"distortion_params": [0, 0, 0.1, 0, 0, 0]}, "beyond k1 k2 p1 p2"),
+        ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, "k4 of a camera model that is no FULL_OPENCV"),
         ({"distortion_params": [0.1]}, "distortion_params"),
-        ({"k5": 0.1}, "beyond k1 k2 p1 p2"),
+        ({"k5": 0.1}, "k5 of a camera model that is no FULL_OPENCV"),
         ({"camera_angle_y": 0.0, "fl_y": None}, "fl_y"),
         ({"y_fov": 200}, "y_fov 200"),
         ({"h": None}, "h is missing"),
@@ -335,25 +344,9 @@ def test_the_documented_keys_are_those_of_the_table() -> None:
 def test_colmap_models_that_are_not_understood_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    monkeypatch.setitem(make.COLMAP_MODELS, "OPENCV_FISHEYE", number)
-    make.write_colmap(tmp_path / "set", images=3, model="OPENCV_FISHEYE", lens=(0,) * 5)
+    monkeypatch.setitem(make.COLMAP_MODELS, "OPENCV", number)
+    make.write_colmap(tmp_path / "set", images=3, model="OPENCV", lens=(0,) * 5)
     fails(tmp_path / "set", f"camera model {COLMAP_NUMBERS.get(number, f'number {number}')} is not supported")
-
-
-@pytest.mark.parametrize("binary", [True, False])
-def test_full_opencv_without_higher_orders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, binary: bool) -> None:
-    monkeypatch.setitem(make.COLMAP_MODELS, "FULL_OPENCV", 6)
-    lens = (0.06, -0.08, -0.001, 0.0002, 0, 0, 0, 0)
-    for last in (0.0, 0.1):
-        shutil.rmtree(tmp_path / "set", ignore_errors=True)
-        camera = (1, "FULL_OPENCV", 32, 24, (38.4, 38.4, 16, 12, *lens[:-1], last))
-        make.write_colmap(tmp_path / "set", images=3)
-        shutil.rmtree(tmp_path / "set/sparse")
-        posed = [(k, make.colmap_pose(c.camera_to_world), 1, f"{k:04d}.png", 0) for k, c in enumerate(make.ring(3))]
-        make.write_colmap_model(tmp_path / "set/sparse/0", [camera], posed, binary)
-        if not last:
-            assert load(tmp_path / "set").pictures.distortion[0].tolist() == list(lens[:4])
-    fails(tmp_path / "set", "beyond k1 k2 p1 p2")
 
 
 # What is left out

@@ -13,6 +13,7 @@ from kpc.format.common.errors import DatasetError
 from kpc.format.container.scene_layout import BOX_LIMIT
 from kpc.format.scene.camera_checks import (
     DISTORTION_KEYS,
+    NO_DISTORTION,
     NUMBER_LIMIT,
     check_depths,
     check_lens,
@@ -25,6 +26,11 @@ from kpc.format.scene.cameras import MAX_SIDE, load_views
 NAN, INF = math.nan, math.inf
 SIZE, LENS = (640, 480), (500.0, 510.0, 320.0, 240.0)
 TURNED = np.array([[0.0, 0, 1, 2], [1, 0, 0, -3], [0, 1, 0, 4], [0, 0, 0, 1]])
+
+
+def full(*coefficients: float) -> tuple[float, ...]:
+    """Return coefficients with those that follow as 0."""
+    return (*coefficients, *NO_DISTORTION[len(coefficients) :])
 
 
 def refused(*words: str) -> Any:
@@ -56,7 +62,7 @@ def refused(*words: str) -> Any:
 )
 def test_lenses_that_are_none(size: Any, lens: Any, distortion: Any, words: str) -> None:
     with refused(words):
-        check_lens("here", size, lens, distortion)
+        check_lens("here", size, lens, full(*distortion))
 
 
 @pytest.mark.parametrize(
@@ -71,7 +77,7 @@ def test_lenses_that_are_none(size: Any, lens: Any, distortion: Any, words: str)
     ],
 )
 def test_lenses_of_real_cameras_are_accepted(size: Any, lens: Any, distortion: Any) -> None:
-    check_lens("here", size, lens, distortion)
+    check_lens("here", size, lens, full(*distortion))
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -84,24 +90,54 @@ def test_a_fold_counts_within_the_picture_only(axis: int) -> None:
         lens = (500.0, 500.0, size[0] / 2, size[1] / 2)
         if folds:
             with refused("folds"):
-                check_lens("here", (size[0], size[1]), lens, (-0.3, 0, 0, 0))
+                check_lens("here", (size[0], size[1]), lens, full(-0.3))
         else:
-            check_lens("here", (size[0], size[1]), lens, (-0.3, 0, 0, 0))
+            check_lens("here", (size[0], size[1]), lens, full(-0.3))
 
 
-@pytest.mark.parametrize("seed", range(80))
-def test_accepted_lenses_are_inverted_over_the_whole_picture(seed: int) -> None:
+@pytest.mark.parametrize("coefficient", range(8))
+def test_every_coefficient_may_fold(coefficient: int) -> None:
+    """A negative numerator of the rational model folds, and so does a positive denominator."""
+    distortion = tuple((3.0 if k > 4 else -3.0) if k == coefficient else 0.0 for k in range(8))
+    with refused("folds"):
+        check_lens("here", SIZE, (200.0, 200.0, 320.0, 240.0), distortion)
+
+
+def test_fisheye_lenses() -> None:
+    """Equidistant, a picture of 640 pixels across shows 640 / 100 radians at a focal length of 100: more than there is.
+
+    A pinhole would show 145 degrees at that focal length.
+    """
+    check_lens("here", SIZE, (160.0, 160.0, 320.0, 240.0), NO_DISTORTION, is_fisheye=True)  # 143 degrees at the corner
+    check_lens("here", SIZE, (400.0, 400.0, 320.0, 240.0), full(-0.02, 0.01, 0, 0, -0.004, 0.001), is_fisheye=True)
+    with refused("more than 170 degrees"):
+        check_lens("here", SIZE, (100.0, 100.0, 320.0, 240.0), NO_DISTORTION, is_fisheye=True)
+    with refused("fisheye distortion k1 -0.4 folds"):
+        check_lens("here", SIZE, (300.0, 300.0, 320.0, 240.0), full(-0.4), is_fisheye=True)
+
+
+SCALES = {
+    "k1 k2 p1 p2": [1.0, 1.0, 0.1, 0.1, 0, 0, 0, 0],
+    "rational": [1.0, 1.0, 0.1, 0.1, 0.5, 1.0, 1.0, 0.5],
+    "fisheye": [0.3, 0.2, 0, 0, 0.1, 0.1, 0, 0],
+}
+
+
+@pytest.mark.parametrize("model", SCALES)
+@pytest.mark.parametrize("seed", range(60))
+def test_accepted_lenses_are_inverted_over_the_whole_picture(seed: int, model: str) -> None:
     rng = np.random.default_rng(seed)
-    coefficients = rng.normal(0, 1, 4) * [1.0, 1.0, 0.1, 0.1] * 10 ** rng.uniform(-2, 1)
+    coefficients = rng.normal(0, 1, 8) * SCALES[model] * 10 ** rng.uniform(-2, 1)
+    is_fisheye = model == "fisheye"
     fl_x, fl_y, cx, cy = lens = (*rng.uniform(200, 900, 2), rng.uniform(-100, 740), rng.uniform(-100, 580))
     try:
-        check_lens("here", SIZE, lens, tuple(coefficients))
+        check_lens("here", SIZE, lens, tuple(coefficients), is_fisheye)
     except DatasetError:
         return
     i, j = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 640, 33), np.linspace(0, 480, 25)))
     x, y = (i - cx) / fl_x, (j - cy) / fl_y
-    u, v = undistort(x, y, np.tile(coefficients, (len(x), 1)))
-    back_x, back_y, (xx, yy, xy) = distort(u, v, tuple(coefficients))
+    u, v = undistort(x, y, np.tile(coefficients, (len(x), 1)), np.full(len(x), is_fisheye))
+    back_x, back_y, (xx, yy, xy) = distort(u, v, tuple(coefficients), is_fisheye)
     np.testing.assert_allclose(np.stack([back_x, back_y]), np.stack([x, y]), atol=1e-9)
     assert (xx * yy - xy * xy > 0).all()  # on the branch that holds the principal point
 
@@ -167,7 +203,8 @@ FRAME = {"w": 48, "h": 36, "fl_x": 40.0, "transform_matrix": TURNED.tolist()}
         ({"transform_matrix": TURNED.ravel().tolist()}, "not 4x4"),
         ({"transform_matrix": [["1", 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "not a number"),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.2}, "OPENCV_FISHEYE"),
-        ({"camera_model": "SIMPLE_RADIAL_FISHEYE"}, "SIMPLE_RADIAL_FISHEYE"),
+        ({"camera_model": "SIMPLE_RADIAL_FISHEYE"}, "SIMPLE_RADIAL_FISHEYE is not rendered"),
+        ({"camera_model": "FOV"}, "FOV is not supported"),
         ({"camera_model": ["PINHOLE"]}, "not supported"),
         ({"is_fisheye": True}, "fisheye"),
         ({"k3": 0.1}, "not rendered"),

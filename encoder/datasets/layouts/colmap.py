@@ -3,7 +3,6 @@
 Source: https://colmap.github.io/format.html
 """
 
-import math
 import sys
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from kpc.encoder.datasets.capture import (
     HOLD_OUT_EVERY,
     Capture,
     CapturedView,
+    Lens,
     find_image,
     first_names,
     holdout_flags,
@@ -18,7 +18,7 @@ from kpc.encoder.datasets.capture import (
     natural_key,
     report_missing,
 )
-from kpc.encoder.datasets.layouts.colmap_model import ModelCamera, ModelImage, count_images, read_cameras, read_images
+from kpc.encoder.datasets.layouts.colmap_model import ModelImage, count_images, read_cameras, read_images
 from kpc.encoder.datasets.left_out import media_in
 from kpc.format.common.errors import DatasetError
 
@@ -76,22 +76,8 @@ def _largest(path: Path) -> tuple[Path, Path]:
     return models[chosen]
 
 
-def _view(
-    images_file: Path, cameras: dict[int, ModelCamera], image: ModelImage, file: Path, is_test: bool
-) -> CapturedView:
+def _view(images_file: Path, cameras: dict[int, Lens], image: ModelImage, file: Path, is_test: bool) -> CapturedView:
     where = f"{images_file} image {image.number}"
     if image.camera not in cameras:
         raise DatasetError(f"{where}: its camera {image.camera} is missing from the model; export the model anew")
-    camera = cameras[image.camera]
-    return image_view(
-        file,
-        where=where,
-        time=None,
-        is_test=is_test,
-        declared=camera.size,
-        intrinsics=camera.intrinsics,
-        distortion=camera.distortion,
-        camera_to_world=image.camera_to_world,
-        near=math.nan,
-        far=math.nan,
-    )
+    return image_view(file, where, cameras[image.camera], image.camera_to_world, time=None, is_test=is_test)

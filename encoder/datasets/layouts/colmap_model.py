@@ -17,14 +17,14 @@ from typing import BinaryIO
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import printable
+from kpc.encoder.datasets.capture import Lens, printable
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.text import open_text
 from kpc.format.scene.camera_checks import DISTORTION_KEYS, check_lens
 from kpc.format.scene.camera_models import (
     COLMAP_NUMBERS,
+    FISHEYE_MODELS,
     PARAMETERS,
-    check_higher_orders,
     understood_model,
 )
 from kpc.format.scene.rotations import rotation_of
@@ -34,15 +34,6 @@ MAX_NAME_BYTES = 4096
 
 # The line of an image's points: triplets of x, y and the number of a point. Possessive, so that time is linear.
 _POINTS = re.compile(r"(?:[-+.0-9eE]++\s++[-+.0-9eE]++\s++-?[0-9]++(?:\s++|\Z))++\Z")
-
-
-@dataclass(frozen=True)
-class ModelCamera:
-    """A camera; `intrinsics` are in pixels of the image size `size`, and `distortion` is k1 k2 p1 p2."""
-
-    size: tuple[float, float]
-    intrinsics: tuple[float, float, float, float]
-    distortion: tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -64,13 +55,13 @@ def count_images(file: Path) -> int:
     return count
 
 
-def read_cameras(file: Path) -> dict[int, ModelCamera]:
+def read_cameras(file: Path) -> dict[int, Lens]:
     """Read the cameras of a model by their numbers.
 
     Raises:
-        DatasetError: the file is damaged, or a camera is not a pinhole with at most k1 k2 p1 p2.
+        DatasetError: the file is damaged, or a camera model is not understood.
     """
-    found: dict[int, ModelCamera] = {}
+    found: dict[int, Lens] = {}
     with _damage(file):
         for number, model, size, params in _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file):
             if number in found:
@@ -79,7 +70,7 @@ def read_cameras(file: Path) -> dict[int, ModelCamera]:
     return found
 
 
-def _camera(where: str, model: str, size: tuple[int, int], params: tuple[float, ...]) -> ModelCamera:
+def _camera(where: str, model: str, size: tuple[int, int], params: tuple[float, ...]) -> Lens:
     """Return a camera from COLMAP's parameters, whose pixel coordinates are ours: pixel centres are at + 0.5."""
     names = PARAMETERS[model].split()
     if len(params) != len(names):
@@ -89,11 +80,10 @@ def _camera(where: str, model: str, size: tuple[int, int], params: tuple[float, 
     value = dict(zip(names, params, strict=True))
     fl_x = value["f"] if "f" in value else value["fx"]
     fl_y = value.get("fy", fl_x)
-    check_higher_orders(where, value)
-    k1, k2, p1, p2 = (value.get(name, 0.0) for name in DISTORTION_KEYS)
-    camera = ModelCamera((float(size[0]), float(size[1])), (fl_x, fl_y, value["cx"], value["cy"]), (k1, k2, p1, p2))
-    check_lens(where, camera.size, camera.intrinsics, camera.distortion)
-    return camera
+    intrinsics, distortion = (fl_x, fl_y, value["cx"], value["cy"]), tuple(value.get(k, 0.0) for k in DISTORTION_KEYS)
+    lens = Lens((float(size[0]), float(size[1])), intrinsics, distortion, model in FISHEYE_MODELS)
+    check_lens(where, size, lens.intrinsics, lens.distortion, lens.is_fisheye)
+    return lens
 
 
 def read_images(file: Path) -> list[ModelImage]:

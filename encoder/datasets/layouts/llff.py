@@ -15,6 +15,7 @@ from kpc.encoder.datasets.capture import (
     HOLD_OUT_EVERY,
     Capture,
     CapturedView,
+    Lens,
     fit_intrinsics,
     holdout_flags,
     image_view,
@@ -24,7 +25,7 @@ from kpc.encoder.datasets.left_out import media_in
 from kpc.encoder.datasets.video import VideoInfo, video_info
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media_files import is_image, is_video
-from kpc.format.scene.camera_checks import check_depths, check_pose
+from kpc.format.scene.camera_checks import NO_DISTORTION, check_depths, check_pose
 
 POSES = "poses_bounds.npy"  # the file of poses and depth ranges
 
@@ -88,27 +89,17 @@ def _view(where: str, file: Path, row: np.ndarray, pose: np.ndarray, is_test: bo
     if np.isnan(row[15:]).any():
         raise DatasetError(f"{where}: near or far is NaN; calibrate anew")
     check_depths(where, near, far)
-    intrinsics, no_distortion = (focal, focal, w / 2, h / 2), (0.0,) * 4
+    intrinsics = (focal, focal, w / 2, h / 2)
     if not is_video(file):
-        return image_view(
-            file,
-            where=where,
-            time=None,
-            is_test=is_test,
-            declared=(w, h),
-            intrinsics=intrinsics,
-            distortion=no_distortion,
-            camera_to_world=pose,
-            near=near,
-            far=far,
-        )
+        lens = Lens((w, h), intrinsics)
+        return image_view(file, where, lens, pose, time=None, is_test=is_test, near=near, far=far)
     video = video_info(file)
     size = video.width, video.height
     if abs(video.pixel_aspect - 1) > NEARLY_SQUARE:
         intrinsics = _fit_stretched(where, file, video, intrinsics, (w, h))
     else:
         intrinsics = fit_intrinsics(where, file, intrinsics, (w, h), size)
-    return CapturedView(file, video, None, is_test, *size, video.has_alpha, intrinsics, no_distortion, pose, near, far)
+    return CapturedView(file, video, None, is_test, *size, video.has_alpha, intrinsics, NO_DISTORTION, pose, near, far)
 
 
 def _fit_stretched(

@@ -13,6 +13,7 @@ from typing import Any
 
 from kpc.encoder.datasets.capture import (
     CapturedView,
+    Lens,
     MaskFile,
     file_exists,
     find_image,
@@ -24,8 +25,8 @@ from kpc.encoder.datasets.layouts.transforms_keys import check_keys
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
 from kpc.format.common.text import open_text
-from kpc.format.scene.camera_checks import DISTORTION_KEYS, number_of, pose_of
-from kpc.format.scene.camera_models import HIGHER_ORDERS, check_higher_orders, understood_model
+from kpc.format.scene.camera_checks import DISTORTION_KEYS, Distortion, number_of, pose_of
+from kpc.format.scene.camera_models import FISHEYE_MODELS, understood_model
 
 # Focal lengths that differ by less than this share are the same.
 SAME_FOCAL = 0.02
@@ -36,8 +37,7 @@ LEAST_FPS, GREATEST_FPS = 1e-3, 1e3
 # Keys that say the same in other words: a frame that has one of them overrides all of the document.
 _SAME = (("fl_x", "camera_angle_x", "x_fov"), ("fl_y", "camera_angle_y", "y_fov"))
 
-# Coefficients of distortion, by themselves and in the order of nerfstudio's list `distortion_params`.
-_COEFFICIENTS = (*DISTORTION_KEYS, *HIGHER_ORDERS)
+# The order of nerfstudio's list `distortion_params`.
 _DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
@@ -93,7 +93,7 @@ def frame_view(
         is_test: whether it is held out.
 
     Raises:
-        DatasetError: a number is missing or malformed, or the camera is not a pinhole with at most k1 k2 p1 p2.
+        DatasetError: a number is missing or malformed, or the camera model is not understood.
     """
     where = f"{file} frame {number}"
     keys = _merged(document, document["frames"][number])
@@ -107,21 +107,14 @@ def frame_view(
     else:
         width, height = declared
     fl_x, fl_y = _focals(where, keys, width, height)
-    intrinsics = (
-        fl_x,
-        fl_y,
-        number_of(where, keys, "cx", width / 2),
-        number_of(where, keys, "cy", height / 2),
-    )
+    centre = number_of(where, keys, "cx", width / 2), number_of(where, keys, "cy", height / 2)
     view = image_view(
         image,
-        where=where,
-        is_test=is_test,
-        declared=declared,
-        intrinsics=intrinsics,
-        distortion=_distortion(where, keys),
-        camera_to_world=pose_of(where, keys),
+        where,
+        Lens(declared, (fl_x, fl_y, *centre), *_distortion(where, keys)),
+        pose_of(where, keys),
         time=number_of(where, keys, "time") if keys.get("time") is not None else None,
+        is_test=is_test,
         near=number_of(where, keys, "near", math.nan),
         far=number_of(where, keys, "far", math.nan),
     )
@@ -168,8 +161,8 @@ def _merged(document: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
     """Return the keys that hold for a frame: its own, and those of the document that it does not override."""
     overridden = {"frames", *(key for same in _SAME if any(k in frame for k in same) for key in same)}
     if "distortion_params" in frame:
-        overridden.update(_COEFFICIENTS)
-    elif any(k in frame for k in _COEFFICIENTS):
+        overridden.update(DISTORTION_KEYS)
+    elif any(k in frame for k in DISTORTION_KEYS):
         overridden.add("distortion_params")
     return {**{key: value for key, value in document.items() if key not in overridden}, **frame}
 
@@ -203,19 +196,32 @@ def _focals_of_angles(where: str, keys: dict[str, Any], axis: str, size: float) 
             yield key, size / 2 / math.tan(angle / 2)
 
 
-def _distortion(where: str, keys: dict[str, Any]) -> tuple[float, float, float, float]:
-    """Return k1 k2 p1 p2 of a camera whose model is understood."""
-    for key in ("camera_model", "camera_type"):
-        if keys.get(key) is not None:
-            understood_model(where, printable(str(keys[key])))
+def _distortion(where: str, keys: dict[str, Any]) -> tuple[Distortion, bool]:
+    """Return the coefficients of a camera whose model is understood, and whether it is a fisheye model.
+
+    nerfstudio's k4 of a camera that is no fisheye belongs to r^8, that of OpenCV's rational model to the denominator.
+    """
+    named = [keys[key] for key in ("camera_model", "camera_type") if keys.get(key) is not None]
+    models = [understood_model(where, printable(str(name))) for name in named]
+    is_fisheye = any(model in FISHEYE_MODELS for model in models)
+    if keys.get("is_fisheye") and not is_fisheye:
+        if any(model != "OPENCV" for model in models):
+            raise DatasetError(f"{where}: is_fisheye contradicts camera model {models[0]}; correct it")
+        is_fisheye = True
     if "distortion_params" in keys:
         values = keys["distortion_params"]
         if not (isinstance(values, list) and len(values) == len(_DISTORTION_PARAMS)):
             raise DatasetError(f"{where}: distortion_params is not {len(_DISTORTION_PARAMS)} numbers; export it anew")
         keys = dict(zip(_DISTORTION_PARAMS, values, strict=True))
-    check_higher_orders(where, {k: number_of(where, keys, k, 0.0) for k in HIGHER_ORDERS})
-    k1, k2, p1, p2 = (number_of(where, keys, k, 0.0) for k in DISTORTION_KEYS)
-    return k1, k2, p1, p2
+    distortion = {name: number_of(where, keys, name, 0.0) for name in DISTORTION_KEYS}
+    unused = ("p1", "p2", "k5", "k6") if is_fisheye else () if "FULL_OPENCV" in models else ("k4", "k5", "k6")
+    if wrong := [name for name in unused if distortion[name]]:
+        model = "a fisheye" if is_fisheye else "no FULL_OPENCV"
+        raise DatasetError(
+            f"{where}: {' '.join(wrong)} of a camera model that is {model} is not supported; correct camera_model or "
+            "undistort the images"
+        )
+    return tuple(distortion.values()), is_fisheye
 
 
 def _check_rays(where: str, keys: dict[str, Any], image: Path) -> None:
