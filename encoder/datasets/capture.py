@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.datasets.video import VideoInfo
+from kpc.encoder.datasets.video import VideoInfo, video_info
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
 from kpc.format.common.media_files import IMAGE_SUFFIXES
@@ -20,6 +20,9 @@ from kpc.format.scene.camera_checks import NO_DISTORTION, Distortion, check_dept
 
 # Where neither the dataset nor the user names test images, every eighth is one, as in LLFF (arXiv:1905.00889).
 HOLD_OUT_EVERY = 8
+
+# Pixels of a video whose aspect differs from 1 by no more are taken as square.
+NEARLY_SQUARE = 5e-3
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,8 @@ class CapturedView:
         upright: whether that orientation is applied.
         mask: the mask that the dataset's own files name; None if they name none.
         is_fisheye: whether `distortion` is that of OpenCV's fisheye model.
+        foreground: a mask that is the image's alpha: what is 0 there is transparent.
+        camera: the camera's name, where it is not that of the file.
     """
 
     file: Path
@@ -88,6 +93,8 @@ class CapturedView:
     upright: bool = False
     mask: MaskFile | None = None
     is_fisheye: bool = False
+    foreground: Path | None = None
+    camera: str | None = None
 
 
 @dataclass(frozen=True)
@@ -131,7 +138,7 @@ def image_view(
     """
     info = image_info(file)
     width, height = info.width, info.height
-    upright = lens.size is not None and _fits(lens.size, info.displayed_size) and not _fits(lens.size, (width, height))
+    upright = lens.size is not None and fits(lens.size, info.displayed_size) and not fits(lens.size, (width, height))
     if upright:
         width, height = info.displayed_size
     intrinsics = fit_intrinsics(where, file, lens.intrinsics, lens.size or (width, height), (width, height))
@@ -156,6 +163,55 @@ def image_view(
     )
 
 
+def video_view(file: Path, where: str, lens: Lens, camera_to_world: np.ndarray, is_test: bool) -> CapturedView:
+    """Return the view of the video of a camera that stands still.
+
+    Args:
+        file: the video.
+        where: the calibration's file and entry, for messages.
+        lens, camera_to_world: not checked.
+        is_test: whether it is held out.
+
+    Raises:
+        DatasetError: the calibration is not that of a camera, or for pictures of another shape.
+    """
+    video = video_info(file)
+    size = video.width, video.height
+    if abs(video.pixel_aspect - 1) > NEARLY_SQUARE and lens.size != size:
+        raise DatasetError(
+            f"{file}: its pixels are not square (width {video.pixel_aspect:.4g} of the height), and {where} is not for "
+            f"{size[0]}x{size[1]}; scale it to {round(size[0] * video.pixel_aspect)}x{size[1]}"
+        )
+    intrinsics = fit_intrinsics(where, file, lens.intrinsics, lens.size or size, size)
+    check_lens(where, size, intrinsics, lens.distortion, lens.is_fisheye)
+    pose = check_pose(where, camera_to_world)
+    return CapturedView(
+        file,
+        video,
+        None,
+        is_test,
+        *size,
+        video.has_alpha,
+        intrinsics,
+        lens.distortion,
+        pose,
+        is_fisheye=lens.is_fisheye,
+    )
+
+
+def opengl_pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Return the (4, 4) camera-to-world pose in the OpenGL convention of OpenCV's x_camera = R x_world + t.
+
+    OpenCV's camera looks along z and has y down, OpenGL's looks along -z and has y up.
+    """
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T * [1, -1, -1]
+    # A translation that overflows is refused later, with other poses that are not finite.
+    with np.errstate(over="ignore", invalid="ignore"):
+        pose[:3, 3] = -rotation.T @ translation
+    return pose
+
+
 def fit_intrinsics(
     where: str,
     file: Path,
@@ -172,13 +228,13 @@ def fit_intrinsics(
         declared, actual: width and height.
 
     Raises:
-        DatasetError: the intrinsics are not those of a camera, or the aspect ratios differ by more than 1 % and a pixel
-            of rounding: then the image was cropped, and it is unknown where.
+        DatasetError: the intrinsics are not those of a camera, or the aspect ratios differ by more than a pixel of
+            rounding: then the image was cropped or padded, and it is unknown where.
     """
     check_lens(where, declared, intrinsics)
     fl_x, fl_y, cx, cy = intrinsics
     sx, sy = actual[0] / declared[0], actual[1] / declared[1]
-    if not _fits(declared, actual):
+    if not fits(declared, actual):
         raise DatasetError(
             f"{file}: is {actual[0]}x{actual[1]}, but {where} is for {declared[0]:g}x{declared[1]:g}, another aspect "
             "ratio; undo the crop or correct the size there"
@@ -186,9 +242,10 @@ def fit_intrinsics(
     return fl_x * sx, fl_y * sy, cx * sx, cy * sy
 
 
-def _fits(declared: tuple[float, float], actual: tuple[int, int]) -> bool:
-    """Return whether two sizes have the same aspect ratio, within 1 % and a pixel of rounding."""
-    return declared[1] > 0 and abs(declared[0] * actual[1] / declared[1] - actual[0]) <= 1 + 0.01 * actual[0]
+def fits(declared: tuple[float, float], actual: tuple[int, int]) -> bool:
+    """Return whether two sizes have the same aspect ratio, but for a pixel of rounding on each axis."""
+    crossed = declared[0] * actual[1] - actual[0] * declared[1]
+    return declared[1] > 0 and abs(crossed) <= declared[0] + declared[1]
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:

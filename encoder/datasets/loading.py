@@ -12,21 +12,36 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import Capture, CapturedView, MaskFile, first_names, report_orientations
 from kpc.encoder.datasets.dataset import Dataset, Pictures
-from kpc.encoder.datasets.layouts import blender, colmap, llff, nerfstudio
+from kpc.encoder.datasets.layouts import (
+    anipose,
+    blender,
+    caliscope,
+    colmap,
+    easymocap,
+    llff,
+    nerfies,
+    nerfstudio,
+    opencv,
+    panoptic,
+    qualisys,
+)
 from kpc.encoder.datasets.left_out import count_left_out
 from kpc.encoder.datasets.masks import find_masks, load_masks
 from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
 from kpc.encoder.datasets.timeline import align
 from kpc.encoder.datasets.video import VideoInfo, read_video
 from kpc.format.common.errors import DatasetError, MediaError
-from kpc.format.common.images import read_image
+from kpc.format.common.images import read_image, read_mask
 from kpc.format.common.progress import Progress
 from kpc.format.common.text import one_line, valid_unicode
 from kpc.format.scene.camera_checks import NUMBER_LIMIT
 from kpc.format.scene.scene import Clip
 
 # The first layout that recognises a folder reads it: formats to which a COLMAP model is exported precede COLMAP's own.
-LAYOUTS = (llff, blender, nerfstudio, colmap)
+LAYOUTS = (
+    *(llff, blender, nerfstudio, nerfies, easymocap, panoptic, caliscope, anipose, qualisys),
+    *(colmap, opencv),
+)
 
 # Frame rate of images with times whose dataset does not give one, frames per second.
 ASSUMED_FPS = 30.0
@@ -98,7 +113,9 @@ def _recognise(root: Path, holdout: str | None) -> Capture:
         return capture
     raise DatasetError(
         f"{root}: no dataset layout recognised; it needs one of: poses_bounds.npy (N3DV, LLFF), transforms_train.json "
-        "(Blender, D-NeRF), transforms.json (nerfstudio, instant-ngp), sparse/0 with cameras and images (COLMAP)"
+        "(Blender, D-NeRF), transforms.json (nerfstudio, instant-ngp), dataset.json (Nerfies), intri.yml and extri.yml "
+        "(EasyMocap), calibration_*.json (Panoptic Studio), camera_array.toml (Caliscope), calibration.toml (Anipose), "
+        "*.qca.txt (Qualisys), sparse/0 with cameras and images (COLMAP), K R t in YAML or JSON (OpenCV)"
     )
 
 
@@ -155,7 +172,7 @@ def _load(
         near=np.array([v.near for v in views], np.float32)[view_of],
         far=np.array([v.far for v in views], np.float32)[view_of],
     )
-    names = tuple(Path(files[p]).stem for p in first)
+    names = tuple(valid_unicode(views[view_of[p]].camera or Path(files[p]).stem) for p in first)
     if masks is not None and not masks.counts[~pictures.is_test].any():
         raise DatasetError(
             f"{root}: its masks ignore every pixel to train on (0 means ignored); invert the masks or remove them"
@@ -182,7 +199,7 @@ def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray,
     Videos are aligned by `timeline.align`. The time of an image is the dataset's if all are within [0, 1], else shifted
     and scaled to [0, 1]; the frame count of their clip follows from the median step between times of training images.
     """
-    videos = {view.file.name: view.video for view in capture.views if view.video}
+    videos = {_name(root, capture, view): view.video for view in capture.views if view.video}
     if videos:
         _report_notes(root, videos)
         timeline = align(root, videos)
@@ -205,6 +222,12 @@ def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray,
     steps = np.diff(np.unique(np.round(times[[not view.is_test for view in capture.views]], 6)))
     count = min(1 + round(1 / float(np.median(steps))), len(times)) if len(steps) else 1
     return still, times, Clip(count, float(capture.fps or ASSUMED_FPS)), None
+
+
+def _name(root: Path, capture: Capture, view: CapturedView) -> str:
+    """Return the name of a view's file, with its folders if another has the same."""
+    is_own = sum(other.file.name == view.file.name for other in capture.views) == 1
+    return view.file.name if is_own else view.file.relative_to(root).as_posix()
 
 
 def _report_notes(root: Path, videos: dict[str, VideoInfo]) -> None:
@@ -239,6 +262,11 @@ def _cached_pixels(
         (view.file.relative_to(root).as_posix(), view.file.stat().st_size, view.file.stat().st_mtime_ns, view.upright)
         for view in views
     ]
+    sources += [
+        (view.foreground.relative_to(root).as_posix(), stat.st_size, stat.st_mtime_ns, False)
+        for view in views
+        if view.foreground is not None and (stat := view.foreground.stat())
+    ]
     fingerprint = fingerprint_of(sources, [(some.start, some.stop) for some in frames], downscale)
     cache = open_cache(file, fingerprint)
     if cache is not None:
@@ -262,9 +290,22 @@ def _cached_pixels(
 def _decoded(view: CapturedView, frames: range) -> Iterator[np.ndarray]:
     """Yield the image of a view, or the given frames of its video."""
     if view.video is None:
-        yield read_image(view.file, upright=view.upright)
+        picture = read_image(view.file, upright=view.upright)
+        yield picture if view.foreground is None else _on_nothing(picture, view.foreground)
     else:
         yield from read_video(view.file, view.video, frames.start, frames.stop)
+
+
+def _on_nothing(picture: np.ndarray, foreground: Path) -> np.ndarray:
+    """Return a picture, (H, W, 3 or 4) uint8, with alpha 0 where a mask shows no foreground, (H, W, 4)."""
+    shown = read_mask(foreground)
+    if shown.shape != picture.shape[:2]:
+        raise DatasetError(
+            f"{foreground}: is {shown.shape[1]}x{shown.shape[0]}, but its picture is {picture.shape[1]}x"
+            f"{picture.shape[0]}; make the mask anew at that size"
+        )
+    alpha = np.where(shown, picture[..., 3] if picture.shape[2] == 4 else 255, 0).astype(np.uint8)
+    return np.concatenate([picture[..., :3], alpha[..., None]], axis=2)
 
 
 def downscale_picture(picture: np.ndarray, factor: int) -> np.ndarray:

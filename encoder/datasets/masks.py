@@ -98,7 +98,7 @@ def find_masks(root: Path, views: Sequence[CapturedView]) -> list[MaskFile | Non
         MediaError: a mask cannot be read.
     """
     folder = root / FOLDER
-    masks = [None if view.video else _find(root, folder, view) for view in views]
+    masks = [None if view.video or view.foreground else _find(root, folder, view) for view in views]
     for view, mask in zip(views, masks, strict=True):
         if mask is not None:
             info, size = image_info(mask.path), (view.width, view.height)
@@ -108,6 +108,8 @@ def find_masks(root: Path, views: Sequence[CapturedView]) -> list[MaskFile | Non
                     "make the mask anew at that size"
                 )
     unmasked = [view.file.name for view, mask in zip(views, masks, strict=True) if mask is None and not view.video]
+    if any(view.foreground for view in views):
+        return masks  # their folder has been read as alpha
     if unmasked and (any(masks) or folder.is_dir()):
         total = sum(not view.video for view in views)
         print(

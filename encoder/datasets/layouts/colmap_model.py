@@ -17,7 +17,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import Lens, printable
+from kpc.encoder.datasets.capture import Lens, opengl_pose, printable
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.text import open_text
 from kpc.format.scene.camera_checks import DISTORTION_KEYS, check_lens
@@ -111,12 +111,7 @@ def _camera_to_world(where: str, pose: tuple[float, ...]) -> np.ndarray:
     if not (all(map(math.isfinite, pose)) and 0 < length < math.inf):
         raise DatasetError(f"{where}: pose holds NaN, infinity or no rotation; remove the image or calibrate it anew")
     rotation = rotation_of(np.array(pose[:4]) / length)  # normalised first, since large entries would overflow
-    camera_to_world = np.eye(4)
-    camera_to_world[:3, :3] = rotation.T * [1, -1, -1]
-    # A translation that overflows is refused later, with other poses that are not finite.
-    with np.errstate(over="ignore", invalid="ignore"):
-        camera_to_world[:3, 3] = -rotation.T @ np.array(pose[4:])
-    return camera_to_world
+    return opengl_pose(rotation, np.array(pose[4:]))
 
 
 def _binary_cameras(file: Path) -> Iterator[tuple[int, str, tuple[int, int], tuple[float, ...]]]:

@@ -13,10 +13,12 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import (
     HOLD_OUT_EVERY,
+    NEARLY_SQUARE,
     Capture,
     CapturedView,
     Lens,
     fit_intrinsics,
+    fits,
     holdout_flags,
     image_view,
 )
@@ -28,8 +30,6 @@ from kpc.format.common.media_files import is_image, is_video
 from kpc.format.scene.camera_checks import NO_DISTORTION, check_depths, check_pose
 
 POSES = "poses_bounds.npy"  # the file of poses and depth ranges
-
-NEARLY_SQUARE = 5e-3  # pixels of a video whose aspect differs from 1 by no more are taken as square
 
 
 # The layout's name in messages; with videos it is that of Neural 3D Video.
@@ -111,7 +111,7 @@ def _fit_stretched(
 ) -> tuple[float, float, float, float]:
     """Return `fit_intrinsics` for a video whose pixels are not square; a single focal length is for square ones."""
     shown = round(video.width * video.pixel_aspect), video.height
-    if abs(declared[0] * shown[1] / declared[1] - shown[0]) > 1 + 0.01 * shown[0]:
+    if not fits(declared, shown):
         raise DatasetError(
             f"{file}: its pixels are not square (width {video.pixel_aspect:.4g} of the height), and {where} gives one "
             f"focal length for {declared[0]:g}x{declared[1]:g}; scale it to {shown[0]}x{shown[1]} and calibrate"

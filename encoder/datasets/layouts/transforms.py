@@ -3,7 +3,6 @@
 The document describes a camera and lists frames, which may override it. `transforms_keys.py` has all its keys.
 """
 
-import json
 import math
 import sys
 from collections.abc import Iterator
@@ -21,10 +20,10 @@ from kpc.encoder.datasets.capture import (
     printable,
     report_missing,
 )
+from kpc.encoder.datasets.layouts.documents import read_json
 from kpc.encoder.datasets.layouts.transforms_keys import check_keys
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
-from kpc.format.common.text import open_text
 from kpc.format.scene.camera_checks import DISTORTION_KEYS, Distortion, number_of, pose_of
 from kpc.format.scene.camera_models import FISHEYE_MODELS, understood_model
 
@@ -47,11 +46,7 @@ def load_transforms(file: Path) -> dict[str, Any]:
     Raises:
         DatasetError: it is not JSON, lacks those, or a key is refused.
     """
-    try:
-        with open_text(file) as text:
-            document = json.load(text, object_pairs_hook=_without_repetition)
-    except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{file}: not JSON ({printable(str(error))}); export it anew") from error
+    document = read_json(file)
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not frames:
         raise DatasetError(f"{file}: lists no frames; export it anew")
@@ -145,16 +140,6 @@ def frame_rate(file: Path, document: dict[str, Any]) -> float | None:
     if not LEAST_FPS <= fps <= GREATEST_FPS:
         raise DatasetError(f"{file}: fps {fps:g} is not from {LEAST_FPS:g} to {GREATEST_FPS:g}; correct it")
     return fps
-
-
-def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a JSON object as a dictionary; raise ValueError if a key is there twice."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-        raise ValueError(f"the key {twice!r} is there twice in one object")
-    return found
 
 
 def _merged(document: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
