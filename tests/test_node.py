@@ -19,7 +19,7 @@ from partial_scenes import coded
 from scenes import tiny_scene
 
 WEB = Path(__file__).parent.parent / "player" / "web"
-BUILT = ("kpc-player.js", "kpc-worker.js")
+BUILT = ("kpc-player.js", "kpc-three.js", "kpc-worker.js")
 COMPRESSED_LIMIT_BYTES = 200_000
 
 

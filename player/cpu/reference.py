@@ -104,21 +104,23 @@ def render_rays(
     *,
     part: Part = Part.FULL,
     appearance: np.ndarray | None = None,
+    limits: np.ndarray | None = None,
 ) -> Rendering:
     """Render rays, (N, 3) float32 origins and unit directions in world coordinates. Only the result grows with N.
-    `appearance` as in `appearance_code`."""
+    `appearance` as in `appearance_code`. Rays see samples nearer than `limits`, (N,) distances in the world, only."""
     if not 0.0 <= time <= 1.0:
         raise ValueError(f"time {time} lies outside [0, 1]")
     if part is Part.DYNAMIC:
-        full = render_rays(scene, origins, directions, time, appearance=appearance)
-        static = render_rays(scene, origins, directions, time, part=Part.STATIC, appearance=appearance)
+        full = render_rays(scene, origins, directions, time, appearance=appearance, limits=limits)
+        static = render_rays(scene, origins, directions, time, part=Part.STATIC, appearance=appearance, limits=limits)
         return Rendering(np.abs(full.rgb - static.rgb), full.depth, full.opacity, full.samples)
     moment, code = SceneAtTime.of(scene, time, with_motion=part is Part.FULL), appearance_code(scene, appearance)
     n = len(origins)
     out = Rendering(np.empty((n, 3), np.float32), *(np.empty(n, t) for t in (np.float32, np.float32, np.int32)))
     for start in range(0, n, RAYS_AT_ONCE):
         block = slice(start, start + RAYS_AT_ONCE)
-        piece = _march(scene, moment, code, origins[block], directions[block])
+        seen = None if limits is None else limits[block]
+        piece = _march(scene, moment, code, origins[block], directions[block], seen)
         out.rgb[block], out.depth[block] = piece.rgb, piece.depth
         out.opacity[block], out.samples[block] = piece.opacity, piece.samples
     return out
@@ -294,7 +296,12 @@ def composite(alphas: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _march(
-    scene: Scene, moment: SceneAtTime, code: np.ndarray, origins: np.ndarray, directions: np.ndarray
+    scene: Scene,
+    moment: SceneAtTime,
+    code: np.ndarray,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    limits: np.ndarray | None,
 ) -> Rendering:
     n, path = len(origins), None
     if isinstance(scene.mapping, DeviceCoordinates):
@@ -311,8 +318,10 @@ def _march(
     while len(rays):
         s = near[rays, None] + (np.arange(first, first + STEPS_AT_ONCE, dtype=np.float32) + np.float32(0.5)) * step
         t, u, stretch = sample_positions(scene, origins[rays], directions[rays], s)
+        distance = t if path is None else path.distance(s, rays)
+        inside = s < far[rays, None] if limits is None else (s < far[rays, None]) & (distance < limits[rays, None])
         x, y, z = np.clip((u * cells).astype(np.int32), 0, cells - 1).transpose(2, 0, 1)
-        row, column = np.nonzero(moment.occupied[z, y, x] & (s < far[rays, None]))
+        row, column = np.nonzero(moment.occupied[z, y, x] & inside)
 
         f = features(scene, moment, u[row, column])
         alphas = np.zeros_like(s)
@@ -326,7 +335,6 @@ def _march(
         seen = weight[:, None] * colour(scene.decoder, f, terms[ray])
         for channel in range(3):
             rgb[:, channel] += np.bincount(ray, seen[:, channel], n).astype(np.float32)
-        distance = t if path is None else path.distance(s, rays)
         depth += np.bincount(ray, weight * distance[row, column], n).astype(np.float32)
         samples += np.bincount(ray, minlength=n).astype(np.int32)
 

@@ -58,7 +58,7 @@ class Programs:
         if key in self._programs:
             return self._programs[key]
         scene = self._textures.scene
-        macros = {**scene_defines(scene, layout), "COMPUTE": int(compute), "COUNTED": 0, **defines}
+        macros = {**scene_defines(scene, layout), "COMPUTE": int(compute), "COUNTED": 0, "DEPTH_LIMIT": 0, **defines}
         written = {"decoder_weights": self._decoder, "plane_blocks": shader.constants(block_arrays(scene, layout))}
         program: AnyProgram
         vertices = None

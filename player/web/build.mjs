@@ -47,7 +47,14 @@ const bundledText = {
   },
 };
 
-/** Write the module and, for pages that forbid workers from blobs, the worker. */
+const besidePlayer = {
+  name: 'beside the player',
+  setup(build) {
+    build.onResolve({ filter: /\/index\.js$/ }, () => ({ path: './kpc-player.js', external: true }));
+  },
+};
+
+/** Write the module, its part for three.js and, for pages that forbid workers from blobs, the worker. */
 async function build(outdir) {
   const options = { ...MINIFIED, banner: { js: NOTICE }, outdir };
   await esbuild.build({
@@ -55,6 +62,14 @@ async function build(outdir) {
     entryPoints: { 'kpc-player': 'src/index.ts' },
     format: 'esm',
     plugins: [bundledText],
+  });
+  // Beside the player, of which it is a part, and three.js, which the page has.
+  await esbuild.build({
+    ...options,
+    entryPoints: { 'kpc-three': 'src/three/index.ts' },
+    external: ['three'],
+    format: 'esm',
+    plugins: [besidePlayer],
   });
   await esbuild.build({ ...options, entryPoints: { 'kpc-worker': 'src/decoder/worker.ts' }, format: 'iife' });
 }

@@ -124,6 +124,7 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
         "APPEARANCE": rows,
         "COMPUTE": 0,
         "COUNTED": motion,
+        "DEPTH_LIMIT": rows,
     }
     defines |= {"CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc")}
     defines |= {**planes_shape(layout), **decoder_shape(scene.decoder)}

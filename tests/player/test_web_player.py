@@ -19,20 +19,24 @@ from PIL import Image
 
 import kpc
 from kpc.format.common.fidelity import psnr
+from kpc.format.common.images import linear_from_srgb, srgb_from_linear
 from kpc.format.container import groups
 from kpc.format.container.groups import GroupInput
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
 from kpc.player.app.controls import OrbitView
-from kpc.player.cpu.reference import render
+from kpc.player.cpu.reference import render, render_rays
 from kpc.player.sharing.file_server import Handler, Link, serving
 from kpc.player.viewpoints import presets
 from kpc.tools.bench import web_page
 
 SAMPLE = Path(__file__).parent.parent.parent / "samples" / "default.kpc"
 SCRIPT = web_page.WEB / "tests" / "element_browser.mjs"
-SCENARIOS = re.findall(r"^ *scenario\(['`](.+)['`], async", SCRIPT.read_text(encoding="utf-8"), re.MULTILINE)
+SCRIPTS = [SCRIPT, SCRIPT.with_name("three_browser.mjs")]
+SCENARIOS = re.findall(
+    r"^ *scenario\(['`](.+)['`], async", "".join(script.read_text(encoding="utf-8") for script in SCRIPTS), re.MULTILINE
+)
 # A browser that hangs is ended.
 TIMEOUT_S = 400
 # Pictures of pages, to be looked at.
@@ -95,8 +99,10 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Serve the built player, scenes and files that are none."""
     folder = tmp_path_factory.mktemp("site")
     data = SAMPLE.read_bytes()
-    for built in (web_page.WEB / "dist").glob("*.js"):
-        (folder / built.name).write_bytes(built.read_bytes())
+    packages = web_page.WEB / "node_modules"
+    served = [*(web_page.WEB / "dist").glob("*.js"), *(web_page.WEB / "examples").iterdir()]
+    for file in (*served, *(packages / "three" / "build").glob("three.[cm]*.js")):
+        (folder / file.name).write_bytes(file.read_bytes())
     (folder / "scene.kpc").write_bytes(data)
     for name, count in ("long.kpc", 3), ("other.kpc", 4):
         groups.write([GroupInput.of(data, 30 * number) for number in range(count)], folder / name)
@@ -167,3 +173,70 @@ def test_the_picture_is_that_of_the_reference(results: dict[str, Any]) -> None:
     height, width = picture.shape[:2]
     wanted = render(scene, opening.camera.resized(width, height), 1.3 * 12 / 29).rgb.clip(0, 1)
     assert psnr(picture, wanted) >= 45
+
+
+def rays_of(found: dict[str, Any], shot: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where rays of a picture of three.js begin and end, (H, W, 3) world units, and (N, 4, 4) matrices of the
+    clip and of the squares in it."""
+    inverse, pose = (np.reshape(shot[name], (4, 4)).T for name in ("inverse", "camera"))
+    x = (np.arange(found["width"]) + 0.5) / found["width"] * 2 - 1
+    y = 1 - (np.arange(found["height"]) + 0.5) / found["height"] * 2
+    near, far = (1, 0) if shot["isReversed"] else (-1, 1)
+    ends = []
+    for z in (near, far):
+        places = np.stack([*np.meshgrid(x, y), *np.broadcast_arrays(z, 1.0, np.ones((len(y), len(x))))[:2]], axis=-1)
+        world = places @ (pose @ inverse).T
+        ends.append(world[..., :3] / world[..., 3:])
+    matrices = [found["object"], *(square["matrix"] for square in found["squares"])]
+    return ends[0], ends[1], np.reshape(matrices, (-1, 4, 4)).transpose(0, 2, 1)
+
+
+def within(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Return points of the world in the space of an object."""
+    inverse = np.linalg.inv(matrix)
+    return np.asarray(points @ inverse[:3, :3].T + inverse[:3, 3])
+
+
+@pytest.mark.parametrize("name", ["perspective", "orthographic", "reversed", "target"])
+def test_meshes_of_three_hide_and_are_hidden(name: str, results: dict[str, Any]) -> None:
+    found = results["draws a clip among meshes of three.js"]["value"]
+    shot = found["drawn"][name]
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(shot["picture"]))).convert("RGB")) / 255
+    begin, end, (clip, *squares) = rays_of(found, shot)
+    shape = begin.shape[:2]
+    way = np.full(shape, np.inf)  # to the nearest opaque square, in shares of the way from begin to end, as the next
+    wanted = np.broadcast_to(np.array([0x20, 0x40, 0x60]) / 255, (*shape, 3)).copy()
+    hits = []
+    for square, matrix in zip(found["squares"], squares, strict=True):
+        a, b = within(begin, matrix), within(end, matrix)
+        share = a[..., 2] / (a[..., 2] - b[..., 2])
+        at = a + share[..., None] * (b - a)
+        hits.append(np.where(np.abs(at[..., :2]).max(axis=-1) < square["size"] / 2, share, np.inf))
+        if square["opacity"] == 1:
+            nearer = hits[-1] < way
+            wanted[nearer], way[nearer] = square["colour"], hits[-1][nearer]
+    # Rays of the clip begin where three's camera is, or far away; its near plane is before the clip.
+    a, b = within(begin, clip), within(end, clip)
+    length = np.linalg.norm(b - a, axis=-1)
+    directions = ((b - a) / length[..., None]).reshape(-1, 3).astype(np.float32)
+    scene = kpc.load(SAMPLE)
+    assert isinstance(scene, Scene)
+    limits = (np.minimum(way, 1) * length).ravel().astype(np.float32)
+    drawn = render_rays(scene, a.reshape(-1, 3).astype(np.float32), directions, 1.3 * 12 / 29, limits=limits)
+    through = 1 - drawn.opacity.reshape(*shape, 1)
+    light = linear_from_srgb if name == "target" else np.asarray  # what colours are blended in
+    own = (drawn.rgb.reshape(*shape, 3) - through * scene.background) / np.maximum(1 - through, 1e-6)
+    wanted = (1 - through) * light(own) + through * light(wanted)
+    depth = np.where(drawn.opacity.reshape(shape) >= 0.5, drawn.depth.reshape(shape) / length, np.inf)
+    last = found["squares"][-1]
+    is_seen = hits[-1] < np.minimum(depth, way)
+    wanted[is_seen] += last["opacity"] * (np.array(last["colour"]) - wanted[is_seen])
+    wanted = (srgb_from_linear(wanted) if name == "target" else wanted).clip(0, 1)
+    error = np.abs(picture - wanted).max(axis=-1)
+    assert shot["error"] == 0 and found["hits"] == 1
+    # Three opaque squares, a part of one behind the clip, and a part of the one that can be seen through.
+    assert [int((hit < np.inf).sum()) > 50 for hit in hits] == [True] * 4
+    assert (hits[2] < np.inf)[~is_seen & (through[..., 0] < 0.1)].sum() > 50 and is_seen.sum() > 50
+    # Edges of squares, of which "target" has smooth ones, are all that is off.
+    assert np.mean(error <= 2 / 255) >= (0.95 if name == "target" else 0.98)
+    assert psnr(picture, wanted) >= (27 if name == "target" else 34)

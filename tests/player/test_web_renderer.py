@@ -49,8 +49,8 @@ SCENES: dict[str, Callable[[], Scene]] = {
 PARTS = {Part.FULL: "all", Part.STATIC: "static", Part.DYNAMIC: "dynamic"}
 FRAGMENTS = ["march.glsl", "fold.glsl", "upsample_plane.glsl", "present.glsl", "enlarge.glsl", "average.glsl"]
 DEFINES = [
-    {"COMPUTE": 0, "COUNTED": 0, "MODE": 0, "ROWS": 1, "MOTION": 0},
-    {"COMPUTE": 0, "COUNTED": 1, "MODE": 1, "ROWS": 0, "MOTION": 1},
+    {"COMPUTE": 0, "COUNTED": 0, "DEPTH_LIMIT": 0, "MODE": 0, "ROWS": 1, "MOTION": 0},
+    {"COMPUTE": 0, "COUNTED": 1, "DEPTH_LIMIT": 1, "MODE": 1, "ROWS": 0, "MOTION": 1},
 ]
 # A constant. Python rounds the tenth digit of a tie to even, JavaScript up; float32 needs nine.
 NUMBER = re.compile(r"-?\d\.\d{9}e[+-]\d+")

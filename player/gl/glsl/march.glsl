@@ -5,7 +5,8 @@
 // HYBRID: 1 for the hybrid decoder, of layers of WIDTH and HIDDEN units. APPEARANCE: 1 where colours come in more than
 // one appearance. ROWS: 1 where time rows are multiplied in at every sample. CONTRACTED: 1 where the planes hold what
 // lies outside the box, too. MOTION: 1 where samples are displaced. NDC: 1 where all this is in normalised device
-// coordinates. COMPUTE: 1 for a compute shader (GL 4.3). COUNTED: 1 where look-ups of cells are counted.
+// coordinates. DEPTH_LIMIT: 1 where rays end at the depths of a picture that this one becomes part of. COMPUTE: 1 for a
+// compute shader (GL 4.3). COUNTED: 1 where look-ups of cells are counted.
 
 #include "ray.glsl"
 #include "space.glsl"
@@ -13,6 +14,9 @@
 #include "motion.glsl"
 #include "planes.glsl"
 #include "decoder.glsl"
+#if DEPTH_LIMIT
+#include "limits.glsl"
+#endif
 // Constants: density_weight, density_bias, w1, w2, b2, ... (kpc.player.gl.shader_constants), as the next.
 #include "decoder_weights"
 #include "plane_blocks"     // blocks, layer_widths, last_texels, first_layers
@@ -44,6 +48,9 @@ uniform float height;
 uniform vec4 lens;
 uniform mat3 axes;
 uniform vec3 eye;
+#if DEPTH_LIMIT
+uniform float width;  // of the raster, pixels; `height` is its height
+#endif
 
 #if HIDDEN
 // e of a direction, in three parts: x y z xx, yy zz xy yz, zx 1; the last is for b1.
@@ -208,10 +215,14 @@ void add_sample(inout Sums sums, vec4 logits, float thickness, float distance) {
 }
 
 // rgba: colour and opacity; depth_samples: sum of weight times distance, number of samples and, COUNTED, of cells
-// looked up.
+// looked up; DEPTH_LIMIT: fourth, how far the ray could see.
 void march(vec2 fragment, out vec4 rgba, out vec4 depth_samples) {
     Path path = path_of(eye, camera_direction(fragment, height, lens, axes), frame, near, baseline);
     Walk walk = walk_of(path.origin, path.direction, box_low, box_high, cell_count, stride, uniform_distance);
+#if DEPTH_LIMIT
+    float limit = limit_at(fragment / vec2(width, height), eye);
+    walk.far = min(walk.far, parameter_of(path_distance(path, limit), uniform_distance));
+#endif
     Sums sums = Sums(vec3(0.0), 1.0, 0.0, 0.0);
     SamplePoint point;
     bool more = to_occupied(walk, cells, point);
@@ -245,6 +256,9 @@ void march(vec2 fragment, out vec4 rgba, out vec4 depth_samples) {
     depth_samples = vec4(sums.depth, sums.samples, 0.0, 0.0);
 #if COUNTED
     depth_samples.z = cell_look_ups;
+#endif
+#if DEPTH_LIMIT
+    depth_samples.w = limit;
 #endif
 }
 

@@ -78,3 +78,13 @@ float world_distance(Path path, float t) {
     return t;
 #endif
 }
+
+// t along a path of the point at a distance in the world: the inverse of world_distance.
+float path_distance(Path path, float distance) {
+#if NDC
+    float ratio = max(distance - path.t_start, 0.0) / path.t_scale;
+    return path.s_infinity * (1.0 - 1.0 / (1.0 + ratio));
+#else
+    return distance;
+#endif
+}

@@ -25,14 +25,18 @@ export { type Part, type Span, Timeline } from './container/timeline.js';
 export { Core, type SegmentSymbols } from './decoder/core.js';
 export { loadCore } from './decoder/module.js';
 export { DecoderPool, type PoolOptions } from './decoder/pool.js';
+export { appearanceOf, ClipScenes } from './element/clip_scenes.js';
+export { Clock, type ClockEvent } from './element/clock.js';
 export { KpcPlayer } from './element/kpc-player.js';
+
 export type { PlayerError, PlayerErrorCode } from './element/messages.js';
 export type { PlayerRanges } from './element/ranges.js';
 export { RenderError } from './render/context.js';
 export type { DrawnScene } from './render/drawn_scene.js';
+export type { Projection } from './render/merging.js';
 export type { Moment, ShownPart } from './render/picture_job.js';
 export { LEVEL_NAMES, type Level } from './render/quality.js';
-export { type DrawnPicture, type DrawOptions, Renderer, type RendererOptions } from './render/renderer.js';
+export { type DrawnPicture, type DrawOptions, type Frame, Renderer, type RendererOptions } from './render/renderer.js';
 export { Clip, type ClipOptions, type ClipPosition, SceneEvent, type ScenePart } from './streaming/clip.js';
 export type { SceneStream, TexelRows } from './streaming/scene_stream.js';
 

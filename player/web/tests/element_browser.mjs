@@ -9,6 +9,7 @@ import assert from 'node:assert/strict';
 import { join } from 'node:path';
 import { chromium } from 'playwright-core';
 import { FLAGS } from './browser_flags.mjs';
+import { threeScenarios } from './three_browser.mjs';
 
 const EVENTS = [
   ...['loadstart', 'loadedmetadata', 'progress', 'canplay', 'play', 'playing', 'pause', 'waiting', 'timeupdate'],
@@ -607,6 +608,8 @@ scenario('can be used without a mouse', async () => {
   assert.deepEqual(labels.slice(1), names);
   await close(page);
 });
+
+threeScenarios(scenario, browser, address, folder);
 
 const results = {};
 try {

@@ -1,12 +1,12 @@
 /** A canvas on which scenes of a clip are drawn. */
 
 import type { Camera } from '../container/scene_chunks.js';
-import type { DrawnScene } from '../render/drawn_scene.js';
-import type { Moment, ShownPart } from '../render/picture_job.js';
+import type { ShownPart } from '../render/picture_job.js';
 import type { Level } from '../render/quality.js';
 import { Renderer } from '../render/renderer.js';
 import type { Clip } from '../streaming/clip.js';
 import type { SceneStream } from '../streaming/scene_stream.js';
+import { appearanceOf, ClipScenes } from './clip_scenes.js';
 
 export interface PictureOptions {
   /** Frames a second that level `auto` holds; undefined for what suits the device. */
@@ -25,7 +25,7 @@ export interface ShownOptions {
 export class Picture {
   readonly canvas: HTMLCanvasElement;
   readonly #renderer: Renderer;
-  readonly #scenes = new Map<SceneStream, DrawnScene>();
+  readonly #scenes: ClipScenes;
 
   /**
    * @param size width and height in pixels of the screen; to change it later waits for what the card does then.
@@ -34,6 +34,7 @@ export class Picture {
   constructor([width, height]: readonly [number, number], options: PictureOptions) {
     this.canvas = Object.assign(document.createElement('canvas'), { width, height });
     this.#renderer = new Renderer(this.canvas, options);
+    this.#scenes = new ClipScenes(this.#renderer);
   }
 
   get isLost(): boolean {
@@ -53,10 +54,7 @@ export class Picture {
 
   /** Take what has arrived of scenes that are shown or will be; return whether there was anything. */
   take(clip: Clip): boolean {
-    const drawn = clip.scenes.map((scene) => this.#drawn(scene));
-    const before = drawn.map(({ version }) => version);
-    for (const scene of drawn) this.#renderer.upload(scene);
-    return drawn.some(({ version }, i) => version !== before[i]);
+    return this.#scenes.take(clip);
   }
 
   /**
@@ -64,24 +62,21 @@ export class Picture {
    * @returns how many pictures have been shown so far, and whether the last one will not become finer by itself.
    */
   draw(clip: Clip, time: number, camera: Camera, { level, part, appearance }: ShownOptions) {
-    const found = clip.parts(time)[0].scene.appearances.find(({ name }) => name === appearance);
-    return this.#renderer.draw(camera, this.#moments(clip, time), {
+    return this.#renderer.draw(camera, this.#scenes.moments(clip, time), {
       level,
       part,
-      appearance: found?.embedding ?? null,
+      appearance: appearanceOf(clip, time, appearance),
     });
   }
 
   /** Have shaders compiled for that, before there is anything to draw. */
   prepare(clip: Clip, time: number, camera: Camera, { level, part }: ShownOptions): void {
-    this.#renderer.prepare(camera, this.#moments(clip, time), { level, part });
+    this.#renderer.prepare(camera, this.#scenes.moments(clip, time), { level, part });
   }
 
   /** Forget a scene that the clip no longer holds. */
   release(scene: SceneStream): void {
-    const drawn = this.#scenes.get(scene);
-    if (drawn) this.#renderer.removeScene(drawn);
-    this.#scenes.delete(scene);
+    this.#scenes.release(scene);
   }
 
   /** Return the picture as a file. */
@@ -96,21 +91,8 @@ export class Picture {
 
   /** Give everything back; browsers allow a page a few contexts only. */
   dispose(): void {
-    this.#scenes.clear();
     this.#renderer.dispose();
     this.#renderer.gl.getExtension('WEBGL_lose_context')?.loseContext();
     this.canvas.remove();
-  }
-
-  #moments(clip: Clip, time: number): Moment[] {
-    return clip.parts(time).map(({ scene, time, share }) => ({ scene: this.#drawn(scene), time, share }));
-  }
-
-  #drawn(scene: SceneStream): DrawnScene {
-    const known = this.#scenes.get(scene);
-    if (known) return known;
-    const drawn = this.#renderer.addScene(scene);
-    this.#scenes.set(scene, drawn);
-    return drawn;
   }
 }

@@ -7,7 +7,21 @@ import { compose, type Defines, firstError, type Written } from './shader.js';
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 
 /** How numbers of a texture are kept. */
-export type Format = 'rgba32f' | 'rgba16f' | 'rgba8' | 'rg32f' | 'rg16f' | 'r8ui';
+export type Format = 'rgba32f' | 'rgba16f' | 'rgba8' | 'rg32f' | 'rg16f' | 'r8ui' | DepthFormat;
+export const DEPTH_FORMATS = ['depth24stencil8', 'depth24', 'depth32f', 'depth32fstencil8', 'depth16'] as const;
+export type DepthFormat = (typeof DEPTH_FORMATS)[number];
+
+/** How what is drawn joins what is there; by default it replaces it. */
+export interface Blending {
+  /** `opacity`: alpha is its share; `premultiplied`: colours are multiplied by alpha already. */
+  blend?: 'opacity' | 'premultiplied';
+  /** Only what is nearer than what is there, or as near, is drawn; that depths are `rising`: 0 is near. */
+  depths?: 'rising' | 'falling';
+  /** Keep depths, and no colours. */
+  isDepth?: boolean;
+  /** The rectangle to draw, x, y, width and height; all if left out. */
+  scissor?: readonly [number, number, number, number];
+}
 
 export interface Texture {
   readonly handle: WebGLTexture;
@@ -35,7 +49,10 @@ export interface Compilation {
   readonly fence: WebGLSync | null;
 }
 
-const BYTES: Record<Format, number> = { rgba32f: 16, rgba16f: 8, rgba8: 4, rg32f: 8, rg16f: 4, r8ui: 1 };
+const BYTES: Record<Format, number> = {
+  ...{ rgba32f: 16, rgba16f: 8, rgba8: 4, rg32f: 8, rg16f: 4, r8ui: 1 },
+  ...{ depth24stencil8: 4, depth24: 4, depth32f: 4, depth32fstencil8: 8, depth16: 2 },
+};
 
 export const bytesOf = ({ format, size }: Texture): number => BYTES[format] * size.reduce((a, b) => a * b);
 
@@ -138,10 +155,14 @@ export class Device {
     const handle = this.#made(gl.createFramebuffer());
     const [width, height] = textures[0].size;
     gl.bindFramebuffer(gl.FRAMEBUFFER, handle);
-    textures.forEach((texture, i) => {
-      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + i, gl.TEXTURE_2D, texture.handle, 0);
+    const places = textures.map(({ format }, i) => {
+      if (!format.startsWith('depth')) return gl.COLOR_ATTACHMENT0 + i;
+      return format.includes('stencil') ? gl.DEPTH_STENCIL_ATTACHMENT : gl.DEPTH_ATTACHMENT;
     });
-    gl.drawBuffers(textures.map((_, i) => gl.COLOR_ATTACHMENT0 + i));
+    textures.forEach((texture, i) => {
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, places[i], gl.TEXTURE_2D, texture.handle, 0);
+    });
+    gl.drawBuffers(places.map((place, i) => (place === gl.COLOR_ATTACHMENT0 + i ? place : gl.NONE)));
     return { handle, width, height };
   }
 
@@ -230,32 +251,36 @@ export class Device {
       else if (type === gl.FLOAT_VEC2) gl.uniform2fv(location, numbers);
       else if (type === gl.FLOAT_VEC3) gl.uniform3fv(location, numbers);
       else if (type === gl.FLOAT_VEC4) gl.uniform4fv(location, numbers);
+      else if (type === gl.FLOAT_MAT4) gl.uniformMatrix4fv(location, false, numbers);
       else if (type === gl.FLOAT_MAT3) gl.uniformMatrix3fv(location, false, numbers);
       else if (type === gl.FLOAT_MAT4x3) gl.uniformMatrix4x3fv(location, false, numbers);
       else gl.uniform1i(location, Number(value));
     }
   }
 
-  /**
-   * Draw over a viewport of a framebuffer, null being the canvas.
-   * @param opacity share of what is drawn in the result; what is there keeps the rest.
-   * @param scissor the rectangle to draw, x, y, width and height; all if left out.
-   */
+  /** Draw over a viewport of a framebuffer, null being the canvas. */
   draw(
     program: Program,
     into: WebGLFramebuffer | null,
     viewport: readonly [number, number, number, number],
-    { isBlended = false, scissor }: { isBlended?: boolean; scissor?: readonly [number, number, number, number] } = {},
+    { blend, depths, isDepth = false, scissor }: Blending = {},
   ): void {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, into);
     gl.viewport(...viewport);
     for (const test of [gl.DEPTH_TEST, gl.STENCIL_TEST, gl.CULL_FACE, gl.BLEND, gl.SCISSOR_TEST]) gl.disable(test);
-    gl.colorMask(true, true, true, true);
-    if (isBlended) {
+    gl.colorMask(!isDepth, !isDepth, !isDepth, !isDepth);
+    if (blend) {
       gl.enable(gl.BLEND);
       gl.blendEquation(gl.FUNC_ADD);
-      gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+      const factor = blend === 'opacity' ? gl.SRC_ALPHA : gl.ONE;
+      gl.blendFuncSeparate(factor, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    }
+    if (depths) {
+      gl.enable(gl.DEPTH_TEST);
+      gl.depthFunc(depths === 'rising' ? gl.LEQUAL : gl.GEQUAL);
+      gl.depthMask(isDepth);
+      gl.depthRange(0, 1);
     }
     if (scissor !== undefined) {
       gl.enable(gl.SCISSOR_TEST);
@@ -265,8 +290,7 @@ export class Device {
     gl.bindVertexArray(this.#vertices);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);
-    gl.disable(gl.BLEND);
-    gl.disable(gl.SCISSOR_TEST);
+    for (const test of [gl.BLEND, gl.DEPTH_TEST, gl.SCISSOR_TEST]) gl.disable(test);
   }
 
   /** Read what a framebuffer holds of one of its textures: float RGBA, rows from below. */
@@ -335,6 +359,11 @@ export class Device {
       rg32f: [gl.RG32F, gl.RG],
       rg16f: [gl.RG16F, gl.RG],
       r8ui: [gl.R8UI, gl.RED_INTEGER],
+      depth24stencil8: [gl.DEPTH24_STENCIL8, gl.DEPTH_STENCIL],
+      depth24: [gl.DEPTH_COMPONENT24, gl.DEPTH_COMPONENT],
+      depth32f: [gl.DEPTH_COMPONENT32F, gl.DEPTH_COMPONENT],
+      depth32fstencil8: [gl.DEPTH32F_STENCIL8, gl.DEPTH_STENCIL],
+      depth16: [gl.DEPTH_COMPONENT16, gl.DEPTH_COMPONENT],
     };
     return known[format];
   }

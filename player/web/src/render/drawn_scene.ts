@@ -3,9 +3,10 @@
 import { type Camera, columnsOf } from './camera.js';
 import type { Device, Framebuffer } from './device.js';
 import { FOLDING, FoldedPlanes } from './folding.js';
+import type { Limits } from './merging.js';
 import type { Quality } from './quality.js';
 import { extentOf, type SceneSource } from './scene_source.js';
-import { Programs, SceneTextures } from './scene_textures.js';
+import { Programs, SceneTextures, UNIT } from './scene_textures.js';
 
 /** What of a scene to draw into a target. */
 export interface Shot {
@@ -16,6 +17,7 @@ export interface Shot {
   appearance: Float32Array | null; // an embedding; null is the average appearance
   background: ArrayLike<number>;
   isCounted?: boolean; // whether look-ups of cells are counted, too
+  limits?: Limits | null; // how far rays see
 }
 
 /** Texels that are uploaded at once, and before a frame at most: a hundredth of a second on a slow telephone. */
@@ -65,9 +67,9 @@ export class DrawnScene {
   }
 
   /** Whether a picture can be drawn without waiting for compilers; have them begin if not. */
-  isReady(device: Device, quality: Quality, isMoving: boolean): boolean {
+  isReady(device: Device, quality: Quality, isMoving: boolean, isLimited = false): boolean {
     const parts = this.#on(device);
-    const { folded, layout, defines } = this.#way(parts, quality, isMoving, false);
+    const { folded, layout, defines } = this.#way(parts, quality, { isMoving, isLimited });
     const areReady = [
       parts.programs.isReady('march.glsl', layout, defines),
       ...(folded ? FOLDING : []).map((name) => parts.programs.isReady(name, parts.textures.layout, {})),
@@ -76,15 +78,16 @@ export class DrawnScene {
   }
 
   /** Return how to march: through folded planes or not, their layout, and the macros of march.glsl. */
-  #way(parts: Parts, quality: Quality, isWhole: boolean, isCounted: boolean) {
+  #way(parts: Parts, quality: Quality, shot: { isMoving: boolean; isCounted?: boolean; isLimited: boolean }) {
     const { textures, programs } = parts;
-    const isMoving = isWhole && this.source.head.isDynamic;
+    const isMoving = shot.isMoving && this.source.head.isDynamic;
     if (isMoving && quality.folded) parts.folded ??= new FoldedPlanes(textures, programs);
     const folded = isMoving && quality.folded ? parts.folded : null;
     const defines = {
       ROWS: Number(isMoving && !folded),
       MOTION: Number(isMoving && textures.motion !== null),
-      COUNTED: Number(isCounted),
+      COUNTED: Number(shot.isCounted ?? false),
+      DEPTH_LIMIT: Number(shot.isLimited),
     };
     return { folded, layout: folded?.layout ?? textures.layout, defines };
   }
@@ -94,8 +97,8 @@ export class DrawnScene {
     const parts = this.#on(device);
     const { textures, programs } = parts;
     const { head } = this.source;
-    const { camera, time, quality, appearance } = shot;
-    const way = this.#way(parts, quality, shot.isMoving, shot.isCounted ?? false);
+    const { camera, time, quality, appearance, limits = null } = shot;
+    const way = this.#way(parts, quality, { ...shot, isLimited: limits !== null });
     textures.setOccupancy(time);
     if (way.defines.MOTION) textures.setMotion(time);
     if (way.defines.ROWS) textures.setTimeRows(time);
@@ -109,12 +112,15 @@ export class DrawnScene {
       termination: quality.termination,
       background: shot.background,
       appearance: paddedCode(appearance, this.source.decoder.hidden),
+      width: camera.width,
       height: camera.height,
       lens: [camera.focal[0], camera.focal[1], camera.centre[0], camera.centre[1]],
       axes: columns.slice(0, 9),
       eye: columns.slice(9),
+      ...limits?.uniforms,
     });
     textures.bind(planes);
+    if (limits) device.use(limits.depths, UNIT.limits);
     const { width, height } = target;
     device.draw(program, target.handle, [0, 0, width, height], { scissor: [0, firstRow, width, rowCount] });
   }

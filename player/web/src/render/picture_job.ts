@@ -3,6 +3,7 @@
 import { type Camera, resized, texelsPerPixel } from './camera.js';
 import type { Device } from './device.js';
 import type { DrawnScene, Shot } from './drawn_scene.js';
+import type { Limits } from './merging.js';
 import type { Setting } from './pace.js';
 import type { Presentation, Target } from './presentation.js';
 import { LEVELS, type Quality } from './quality.js';
@@ -30,7 +31,8 @@ export interface View {
 export interface Keeping {
   role: string;
   isExact: boolean; // with float32 numbers and depths
-  isCounted: boolean; // with the number of cells that were looked up
+  isCounted?: boolean; // with the number of cells that were looked up
+  limits?: Limits | null; // with depths, rays seeing so far only
 }
 
 /** A finished picture of a moment, at the camera's size or smaller, and the static part to subtract from it. */
@@ -67,7 +69,7 @@ export class PictureJob {
       const background = view.background ?? scene.source.head.background;
       return parts.map((isMoving) => {
         const name = `${keeping.role} ${number} ${isMoving}`;
-        const target = presentation.target(name, camera.width, camera.height, keeping.isExact);
+        const target = presentation.target(name, camera.width, camera.height, keeping);
         return { scene, camera, time, share, quality, isMoving, appearance, background, target, raysAcross };
       });
     });
@@ -101,7 +103,7 @@ export class PictureJob {
     for (const shot of this.#shots) {
       const count = Math.min(more, shot.target.height - first);
       if (count > 0) {
-        shot.scene.march(device, shot.target, { ...shot, isCounted: this.#keeping.isCounted }, first, count);
+        shot.scene.march(device, shot.target, { ...shot, ...this.#keeping }, first, count);
         more -= count;
       }
       first = Math.max(0, first - shot.target.height);
@@ -115,7 +117,7 @@ export class PictureJob {
     const targets = this.#shots.map(({ target, raysAcross, isMoving }, number) => {
       if (raysAcross === 1) return target;
       const name = `mean ${this.role} ${number} ${isMoving}`;
-      const mean = presentation.target(name, camera.width, camera.height, this.#keeping.isExact);
+      const mean = presentation.target(name, camera.width, camera.height, this.#keeping);
       return presentation.average(target, mean, raysAcross);
     });
     const parts = targets.length / moments.length;

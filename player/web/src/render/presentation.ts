@@ -4,6 +4,7 @@ import { CompiledPrograms } from './compiled.js';
 import { RenderError } from './context.js';
 import type { Compilation, Device, Framebuffer, Program, Texture } from './device.js';
 import type { Setting } from './pace.js';
+import type { Keeping } from './picture_job.js';
 import { LEVELS } from './quality.js';
 import { UNIT } from './scene_textures.js';
 import type { Defines } from './shader.js';
@@ -18,8 +19,8 @@ export interface Screen {
 }
 
 /**
- * A picture, rows from below: colour and opacity; if it is exact also the sum of weight times distance, and the numbers
- * of samples and of look-ups.
+ * A picture, rows from below: colour and opacity; if it is exact or has limits also the sum of weight times distance,
+ * the numbers of samples and of look-ups, and the limit.
  */
 export interface Target extends Framebuffer {
   readonly rgba: Texture;
@@ -55,9 +56,10 @@ export class Presentation {
   }
 
   /** Return a target of a size; the last used are kept. */
-  target(name: string, width: number, height: number, isExact: boolean): Target {
-    const key = `${name} ${width} ${height} ${isExact}`;
-    const target = this.#targets.get(key) ?? this.#newTarget(width, height, isExact);
+  target(name: string, width: number, height: number, { isExact, limits = null }: Keeping): Target {
+    const hasSums = isExact || limits !== null;
+    const key = `${name} ${width} ${height} ${isExact} ${hasSums}`;
+    const target = this.#targets.get(key) ?? this.#newTarget(width, height, isExact, hasSums);
     this.#targets.delete(key);
     this.#targets.set(key, target);
     if (this.#targets.size > TARGETS_KEPT) {
@@ -87,7 +89,7 @@ export class Presentation {
     const { device } = this;
     const { x, y, width, height } = screen;
     const viewport = [x, y, width, height] as const;
-    const isBlended = opacity < 1;
+    const blend = opacity < 1 ? 'opacity' : undefined;
     const isSameSize = picture.width === width && picture.height === height;
     const canvas = isSameSize ? null : this.#canvasOf(picture.width, picture.height);
     const present = this.#program('present.glsl', modeOf(still !== null));
@@ -103,14 +105,14 @@ export class Presentation {
     device.use(picture.sums ?? picture.rgba, UNIT.sums);
     device.use((still ?? picture).rgba, UNIT.staticRgba);
     if (canvas === null) {
-      device.draw(present, screen.framebuffer, viewport, { isBlended });
+      device.draw(present, screen.framebuffer, viewport, { blend });
       return;
     }
     device.draw(present, canvas.framebuffer.handle, [0, 0, picture.width, picture.height]);
     const enlarge = this.#program('enlarge.glsl');
     device.set(enlarge, { shown_small: UNIT.rgba, viewport: [width, height], origin: [x, y], opacity });
     device.use(canvas.shown, UNIT.rgba);
-    device.draw(enlarge, screen.framebuffer, viewport, { isBlended });
+    device.draw(enlarge, screen.framebuffer, viewport, { blend });
   }
 
   release(): void {
@@ -132,14 +134,14 @@ export class Presentation {
     return this.device.compile(name, { CONTRACTED: 0, NDC: 0, ...defines }, {});
   }
 
-  #newTarget(width: number, height: number, isExact: boolean): Target {
+  #newTarget(width: number, height: number, isExact: boolean, hasSums: boolean): Target {
     const { device } = this;
     if (Math.max(width, height) > device.maxTextureSize) {
       throw new RenderError(`a picture of ${width}x${height} is larger than ${device.name} takes`);
     }
     const format = device.drawsFloat32 && isExact ? 'rgba32f' : 'rgba16f';
     const rgba = device.texture(format, [width, height], false);
-    const sums = isExact ? device.texture(format, [width, height], false) : null;
+    const sums = hasSums ? device.texture(format, [width, height], false) : null;
     return { ...device.framebuffer(sums ? [rgba, sums] : [rgba]), rgba, sums };
   }
 

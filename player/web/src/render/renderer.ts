@@ -11,6 +11,7 @@ import { type Camera, isSameView, texelsPerPixel } from './camera.js';
 import { contextOf, RenderError } from './context.js';
 import { Device } from './device.js';
 import { DrawnScene } from './drawn_scene.js';
+import { Merging, type Projection } from './merging.js';
 import { Pace, type Setting } from './pace.js';
 import { type Keeping, type Moment, type Picture, PictureJob, type ShownPart, type View } from './picture_job.js';
 import { Presentation, type Screen } from './presentation.js';
@@ -29,6 +30,15 @@ export interface DrawOptions {
   background?: ArrayLike<number> | null;
   /** Where to draw, if not over the whole canvas. The camera's size is taken for the size of the picture. */
   screen?: Screen | null;
+}
+
+/** What another renderer or a headset shows, of which a picture becomes a part. */
+export interface Frame {
+  /** Of the screen's size. */
+  camera: Camera;
+  screen: Screen;
+  /** How it is seen, where it has depths, which hide and are hidden; null: the picture covers the screen. */
+  projection: Projection | null;
 }
 
 export interface DrawnPicture {
@@ -81,6 +91,7 @@ export class Renderer {
   readonly #scenes = new Set<DrawnScene>();
   #device: Device;
   #presentation: Presentation;
+  #merging: Merging | null = null;
   #timer: Timer;
   #shown: Shown | null = null;
   #job: (PictureJob & { versions?: string }) | null = null;
@@ -193,14 +204,55 @@ export class Renderer {
     return this.#state(wanted, false);
   }
 
+  /**
+   * Draw whole pictures at once, into frames that someone else shows, of the same size and about the same view: `auto`
+   * draws as finely as all of them come in time. Nothing is drawn while shaders are being compiled.
+   */
+  drawInto(frames: readonly Frame[], moments: readonly Moment[], options: DrawOptions = {}): DrawnPicture {
+    const { level = 'auto' } = options;
+    const [{ camera, projection }] = frames;
+    const wanted = this.#wanted(camera, moments, options);
+    if (this.isLost) return this.#state(wanted, false);
+    for (const scene of this.#scenes) scene.upload(this.#device);
+    const background = projection ? [0, 0, 0] : options.background;
+    const views = frames.map(({ camera }) => viewOf(camera, moments, { ...options, background }));
+    const merging = projection && this.#mergingOn(this.#device);
+    if (!this.#isReady(views[0], wanted, merging)) return this.#state(wanted, false);
+    const isTimed = !this.#timer.isBusy;
+    let cost = 0;
+    if (isTimed) this.#timer.start((seconds) => level === 'auto' && this.pace.record(cost, seconds));
+    for (const [number, { screen, projection }] of frames.entries()) {
+      const limits = merging && projection && merging.limits(screen, projection);
+      const keeping = { role: 'frame', isExact: wanted.level === 'reference', limits };
+      const job = new PictureJob(views[number], wanted, this.#presentation, keeping);
+      cost += job.raysPerPixel;
+      job.march(this.#device, job.rowsLeft);
+      const pictures = job.finish(this.#presentation);
+      if (merging && projection && limits) merging.show(screen, pictures, limits, projection);
+      else this.#show(screen, pictures);
+    }
+    if (isTimed) this.#timer.finish();
+    this.#pictures++;
+    return { ...wanted, isSharp: false, pictures: this.#pictures };
+  }
+
   /** Show the last picture again: a browser clears a canvas once it has shown it, so do this to read pixels. */
   present(screen: Screen | null = null): void {
     if (this.isLost || this.#shown === null) return;
     const { drawingBufferWidth: width, drawingBufferHeight: height } = this.gl;
     const whole = screen ?? { framebuffer: null, x: 0, y: 0, width, height };
-    for (const [number, { target, still, share }] of this.#shown.pictures.entries()) {
-      this.#presentation.show(whole, target, still, number === 0 ? 1 : share);
+    this.#show(whole, this.#shown.pictures);
+  }
+
+  #show(screen: Screen, pictures: readonly Picture[]): void {
+    for (const [number, { target, still, share }] of pictures.entries()) {
+      this.#presentation.show(screen, target, still, number === 0 ? 1 : share);
     }
+  }
+
+  #mergingOn(device: Device): Merging {
+    this.#merging ??= new Merging(device);
+    return this.#merging;
   }
 
   /**
@@ -212,7 +264,7 @@ export class Renderer {
   async read(camera: Camera, moments: readonly Moment[], options: DrawOptions & { isCounted?: boolean } = {}) {
     const { level = 'auto' } = options;
     const setting = level === 'auto' ? STILL : settingOf(level);
-    const keeping = { role: 'read', isExact: true, isCounted: options.isCounted ?? false };
+    const keeping = { role: 'read', isExact: true, isCounted: options.isCounted };
     await this.#untilIdle();
     for (const scene of this.#scenes) scene.upload(this.#device);
     const job = new PictureJob(viewOf(camera, moments, options), setting, this.#presentation, keeping);
@@ -237,6 +289,7 @@ export class Renderer {
     this.#scenes.clear();
     this.#timer.dispose();
     this.#presentation.release();
+    this.#merging?.release();
     this.#device.dispose();
   }
 
@@ -245,18 +298,18 @@ export class Renderer {
   }
 
   /** Whether no compiler keeps a picture waiting. */
-  #isReady({ moments, part }: View, setting: Setting): boolean {
+  #isReady({ moments, part }: View, setting: Setting, merging: Merging | null = null): boolean {
     this.#device.hasTaken = false;
     const parts = { all: [true], static: [false], dynamic: [true, false] }[part];
     const areReady = moments.flatMap(({ scene }) =>
-      parts.map((isMoving) => scene.isReady(this.#device, LEVELS[setting.level], isMoving)),
+      parts.map((isMoving) => scene.isReady(this.#device, LEVELS[setting.level], isMoving, merging !== null)),
     );
-    areReady.push(this.#presentation.isReady(setting, part === 'dynamic'));
+    areReady.push(this.#presentation.isReady(setting, part === 'dynamic'), merging?.isReady() ?? true);
     return areReady.every((isReady) => isReady);
   }
 
   #newJob(view: View, setting: Setting): PictureJob {
-    const keeping = (role: string): Keeping => ({ role, isExact: setting.level === 'reference', isCounted: false });
+    const keeping = (role: string): Keeping => ({ role, isExact: setting.level === 'reference' });
     if (setting === STILL) return new PictureJob(view, setting, this.#presentation, keeping(STILL_ROLE));
     const role = this.#shown?.role === LIVE[0] ? LIVE[1] : LIVE[0];
     return new PictureJob(view, setting, this.#presentation, keeping(role));
@@ -310,6 +363,7 @@ export class Renderer {
   readonly #onRestored = (): void => {
     this.#device = new Device(this.gl, this.#options);
     this.#presentation = new Presentation(this.#device);
+    this.#merging = null;
     this.#timer = new Timer(this.gl, this.isSoftware);
     this.#shown = this.#job = null;
     this.#options.onRestored?.();

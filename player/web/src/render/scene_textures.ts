@@ -10,7 +10,18 @@ import { constants, type Defines } from './shader.js';
 import { blockArrays, decoderArrays, decoderShape, planesShape } from './shader_constants.js';
 
 /** Texture units. */
-export const UNIT = { planes: 0, rows: 1, cells: 2, motion: 3, rgba: 0, sums: 1, staticRgba: 2 } as const;
+export const UNIT = {
+  planes: 0,
+  rows: 1,
+  cells: 2,
+  motion: 3,
+  rgba: 0,
+  sums: 1,
+  staticRgba: 2,
+  otherRgba: 2,
+  otherSums: 3,
+  limits: 4,
+} as const;
 // vec4s of decoder weights that a shader may hold, as on the desktop; compilers choke on more.
 const MOST_CONSTANTS = 8192;
 
@@ -161,7 +172,7 @@ export class Programs {
 
   #begin(name: string, layout: Layout, defines: Defines): Compilation {
     const { scene } = this.textures;
-    const macros = { ...sceneDefines(scene, layout), COMPUTE: 0, COUNTED: 0, ...defines };
+    const macros = { ...sceneDefines(scene, layout), COMPUTE: 0, COUNTED: 0, DEPTH_LIMIT: 0, ...defines };
     const written = { decoder_weights: this.#decoderWeights, plane_blocks: constants(blockArrays(scene, layout)) };
     return this.device.compile(name, macros, written);
   }
@@ -175,6 +186,7 @@ export class Programs {
       rows: UNIT.rows,
       cells: UNIT.cells,
       motion: UNIT.motion,
+      limits: UNIT.limits,
       nodes: motion?.size ?? [1, 1, 1],
       rows_texel: rows.size.map((side) => 1 / side),
       cell_count: scene.occupancy.sizes.slice(1).reverse(),

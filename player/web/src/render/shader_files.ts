@@ -6,7 +6,9 @@ import decoder from '../../../gl/glsl/decoder.glsl';
 import enlarge from '../../../gl/glsl/enlarge.glsl';
 import fold from '../../../gl/glsl/fold.glsl';
 import fullscreen from '../../../gl/glsl/fullscreen.glsl';
+import limits from '../../../gl/glsl/limits.glsl';
 import march from '../../../gl/glsl/march.glsl';
+import merge from '../../../gl/glsl/merge.glsl';
 import motion from '../../../gl/glsl/motion.glsl';
 import occupancy from '../../../gl/glsl/occupancy.glsl';
 import planes from '../../../gl/glsl/planes.glsl';
@@ -22,7 +24,9 @@ export const SHADER_FILES: Readonly<Record<string, string>> = {
   'enlarge.glsl': enlarge,
   'fold.glsl': fold,
   'fullscreen.glsl': fullscreen,
+  'limits.glsl': limits,
   'march.glsl': march,
+  'merge.glsl': merge,
   'motion.glsl': motion,
   'occupancy.glsl': occupancy,
   'planes.glsl': planes,
