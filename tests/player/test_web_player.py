@@ -33,7 +33,7 @@ from kpc.tools.bench import web_page
 
 SAMPLE = Path(__file__).parent.parent.parent / "samples" / "default.kpc"
 SCRIPT = web_page.WEB / "tests" / "element_browser.mjs"
-SCRIPTS = [SCRIPT, SCRIPT.with_name("three_browser.mjs")]
+SCRIPTS = [SCRIPT, *(SCRIPT.with_name(f"{name}_browser.mjs") for name in ("headset", "three"))]
 SCENARIOS = re.findall(
     r"^ *scenario\(['`](.+)['`], async", "".join(script.read_text(encoding="utf-8") for script in SCRIPTS), re.MULTILINE
 )
@@ -139,6 +139,11 @@ def test_scenario(name: str, results: dict[str, Any]) -> None:
     assert [result["error"] for result in found if result["error"] is not None] == []
 
 
+def pixels_of(picture: str) -> np.ndarray:
+    """Return a PNG in base64 as (H, W, 3) in [0, 1]."""
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(picture))).convert("RGB")) / 255
+
+
 def view_of(text: str) -> np.ndarray:
     """Return the numbers of a camera in words: eye, point that it looks at, vertical angle of view in degrees."""
     return np.array([float(number) for number in text.split()])
@@ -164,7 +169,7 @@ def test_viewpoints_are_those_of_the_desktop_player(results: dict[str, Any]) -> 
 
 def test_the_picture_is_that_of_the_reference(results: dict[str, Any]) -> None:
     value = results["draws what the reference draws"]["value"]
-    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(value["picture"]))).convert("RGB")) / 255
+    picture = pixels_of(value["picture"])
     scene = kpc.load(SAMPLE)
     assert isinstance(scene, Scene)
     opening = scene.metadata.opening
@@ -173,6 +178,24 @@ def test_the_picture_is_that_of_the_reference(results: dict[str, Any]) -> None:
     height, width = picture.shape[:2]
     wanted = render(scene, opening.camera.resized(width, height), 1.3 * 12 / 29).rgb.clip(0, 1)
     assert psnr(picture, wanted) >= 45
+
+
+def test_each_eye_sees_its_own_picture_and_controllers_move_it(results: dict[str, Any]) -> None:
+    found = results["shows the clip in a headset"]["value"]
+    opening, turned, dragged = (pixels_of(found[name]) for name in ("opening", "turned", "dragged"))
+    left, right = np.split(opening, 2, axis=1)
+    width = left.shape[1]
+    apart = [np.abs(left[:, shift:] - right[:, : width - shift]).mean() for shift in range(12)]
+    # Eyes 63 mm apart see what is 1.5 m away, in pictures of a right angle, so many pixels apart.
+    assert abs(int(np.argmin(apart)) - 0.063 / 1.5 * width / 2) < 1.5 and apart[0] > 1.3 * min(apart)
+
+    def centre(picture: np.ndarray) -> np.ndarray:
+        """Return where the scene is on grey ground in the left eye's picture: row and column."""
+        rows, columns = np.nonzero(np.abs(picture[:, :width] - 0.5).max(axis=-1) > 0.05)
+        return np.array([rows.mean(), columns.mean()])
+
+    assert centre(turned)[1] < centre(opening)[1] - 5
+    assert centre(dragged)[0] < centre(turned)[0] - 3
 
 
 def rays_of(found: dict[str, Any], shot: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -201,7 +224,7 @@ def within(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 def test_meshes_of_three_hide_and_are_hidden(name: str, results: dict[str, Any]) -> None:
     found = results["draws a clip among meshes of three.js"]["value"]
     shot = found["drawn"][name]
-    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(shot["picture"]))).convert("RGB")) / 255
+    picture = pixels_of(shot["picture"])
     begin, end, (clip, *squares) = rays_of(found, shot)
     shape = begin.shape[:2]
     way = np.full(shape, np.inf)  # to the nearest opaque square, in shares of the way from begin to end, as the next

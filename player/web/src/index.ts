@@ -31,6 +31,7 @@ export { KpcPlayer } from './element/kpc-player.js';
 
 export type { PlayerError, PlayerErrorCode } from './element/messages.js';
 export type { PlayerRanges } from './element/ranges.js';
+export { pinholeOf } from './render/camera.js';
 export { RenderError } from './render/context.js';
 export type { DrawnScene } from './render/drawn_scene.js';
 export type { Projection } from './render/merging.js';

@@ -9,6 +9,7 @@ import assert from 'node:assert/strict';
 import { join } from 'node:path';
 import { chromium } from 'playwright-core';
 import { FLAGS } from './browser_flags.mjs';
+import { headsetScenarios } from './headset_browser.mjs';
 import { threeScenarios } from './three_browser.mjs';
 
 const EVENTS = [
@@ -609,6 +610,7 @@ scenario('can be used without a mouse', async () => {
   await close(page);
 });
 
+headsetScenarios(scenario, { open, shown, player, button, inside, close, tag: TAG });
 threeScenarios(scenario, browser, address, folder);
 
 const results = {};

@@ -18,5 +18,6 @@ export interface Commands {
   savePicture(): void;
   copyLink(): void;
   toggleFullscreen(): void;
+  toggleHeadset(): void;
   toggleHelp(): void;
 }

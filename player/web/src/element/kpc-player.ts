@@ -313,6 +313,12 @@ export class KpcPlayer extends ReflectedElement implements Model {
     return this.#fullscreen.request(() => super.requestFullscreen(options));
   }
 
+  /** Show the clip in a headset, or leave it; called when something has been pressed, or browsers refuse. */
+  async toggleHeadset(): Promise<void> {
+    if (!this.#session) throw new Error('there is no scene');
+    await this.#session.toggleHeadset(() => this.#commands.playOrPause());
+  }
+
   toggleFullscreen(): void {
     this.#fullscreen.toggle();
   }

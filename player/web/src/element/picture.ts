@@ -3,7 +3,7 @@
 import type { Camera } from '../container/scene_chunks.js';
 import type { ShownPart } from '../render/picture_job.js';
 import type { Level } from '../render/quality.js';
-import { Renderer } from '../render/renderer.js';
+import { type Frame, Renderer } from '../render/renderer.js';
 import type { Clip } from '../streaming/clip.js';
 import type { SceneStream } from '../streaming/scene_stream.js';
 import { appearanceOf, ClipScenes } from './clip_scenes.js';
@@ -67,6 +67,21 @@ export class Picture {
       part,
       appearance: appearanceOf(clip, time, appearance),
     });
+  }
+
+  get gl(): WebGL2RenderingContext {
+    return this.#renderer.gl;
+  }
+
+  /** Whether a processor stands in for a graphics card. */
+  get isSoftware(): boolean {
+    return this.#renderer.isSoftware;
+  }
+
+  /** Draw a clip at a time into the frames of a headset; return how many pictures have been shown so far. */
+  drawInto(frames: readonly Frame[], clip: Clip, time: number, { level, part, appearance }: ShownOptions): number {
+    const options = { level, part, appearance: appearanceOf(clip, time, appearance) };
+    return this.#renderer.drawInto(frames, this.#scenes.moments(clip, time), options).pictures;
   }
 
   /** Have shaders compiled for that, before there is anything to draw. */

@@ -140,6 +140,14 @@ export class PlayerCommands implements Commands {
     this.#player.toggleFullscreen();
   }
 
+  async toggleHeadset(): Promise<void> {
+    try {
+      await this.#player.toggleHeadset();
+    } catch (error) {
+      this.#ui().notify(`The headset cannot show the scene: ${(error as Error).message}.`);
+    }
+  }
+
   toggleHelp(): void {
     this.#ui().toggleKeys();
   }

@@ -8,6 +8,7 @@ import { cameraOf, type View, viewFromText, viewOf } from './camera/view.js';
 import { ViewControl } from './camera/view_control.js';
 import type { Clock } from './clock.js';
 import { loadDriver } from './driver.js';
+import { Headset } from './headset/headset.js';
 import type { Input } from './input.js';
 import { Picture, type ShownOptions } from './picture.js';
 
@@ -58,6 +59,7 @@ export class Session {
   readonly #resizes = new ResizeObserver((entries) => this.#resized(entries[0]));
   readonly #sight = new IntersectionObserver((entries) => this.#sighted(entries[entries.length - 1].isIntersecting));
   #picture: Picture | null = null;
+  #headset: Headset | null = null;
   #size: [number, number] = [0, 0];
   #isInSight = true;
   #isReduced = false;
@@ -156,6 +158,7 @@ export class Session {
 
   /** Draw at the next opportunity, and go on as long as something changes. */
   wake(): void {
+    if (this.#headset) return; // which has frames of its own
     if (this.#request === 0 && !this.#isClosed) this.#request = requestAnimationFrame((now) => this.#frame(now));
   }
 
@@ -165,6 +168,37 @@ export class Session {
     this.#shownWords = shown;
     this.#isSharp = false;
     this.wake();
+  }
+
+  /** Show the clip in a headset, or leave it. */
+  async toggleHeadset(selected: () => void): Promise<void> {
+    if (this.#headset) return this.#headset.leave();
+    const { clip, view } = this;
+    const picture = this.#picture;
+    if (clip === null || view === null || picture === null) throw new Error('the scene has not arrived yet');
+    const { fps, clock } = this.#options;
+    this.#headset = await Headset.enter({
+      gl: picture.gl,
+      view: view.view,
+      metresPerUnit: clip.metadata.metres_per_unit,
+      holds: (headsetFps) => {
+        picture.fps = picture.isSoftware ? undefined : headsetFps;
+      },
+      advance: (seconds) => {
+        this.#advance(clip, seconds);
+        this.#events.frame();
+      },
+      draw: (frames) => {
+        if (clip.canShow(clock.time) || this.isShown) picture.drawInto(frames, clip, clock.time, this.#shownOptions());
+      },
+      selected,
+      left: () => {
+        this.#headset = null;
+        picture.fps = fps;
+        this.#isSharp = false;
+        this.wake();
+      },
+    });
   }
 
   /** Return the picture as a file, once it is as fine as it will be; while the clip plays, at once. */
@@ -184,6 +218,7 @@ export class Session {
     cancelAnimationFrame(this.#request);
     this.#resizes.disconnect();
     this.#sight.disconnect();
+    this.#headset?.leave();
     this.clip?.close();
     this.#picture?.dispose();
     this.clip = this.view = this.#picture = null;
@@ -198,8 +233,7 @@ export class Session {
     const seconds = this.#lastFrame === 0 ? 0 : (now - this.#lastFrame) / 1000;
     this.#input.advance(seconds);
     const isMoving = view.advance(seconds) || this.#input.isActive;
-    if (this.fetches) clip.setPlayhead({ time: clock.time, rate: clock.speed, loop: clock.loop });
-    clock.tick(seconds, (time) => this.isShown && clip.canShow(time));
+    this.#advance(clip, seconds);
     if (this.#isClosed) return; // by a listener
     if (view.view !== this.#shownView) {
       if (this.#shownView !== null) this.#events.viewChanged();
@@ -215,6 +249,13 @@ export class Session {
     const isGoing = isMoving || !clock.paused || clock.isSeeking || !this.#isSharp;
     this.#lastFrame = isGoing ? now : 0;
     if (isGoing) this.wake();
+  }
+
+  /** Let time pass. */
+  #advance(clip: Clip, seconds: number): void {
+    const { clock } = this.#options;
+    if (this.fetches) clip.setPlayhead({ time: clock.time, rate: clock.speed, loop: clock.loop });
+    clock.tick(seconds, (time) => this.isShown && clip.canShow(time));
   }
 
   #draw(): void {

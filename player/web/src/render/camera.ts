@@ -18,6 +18,14 @@ export function resized(camera: Camera, width: number, height: number): Camera {
   return { width, height, focal, centre, pose: camera.pose };
 }
 
+/** Return the lens of a perspective projection, a 4x4 matrix column by column, for a picture of this size. */
+export function pinholeOf(projection: ArrayLike<number>, width: number, height: number) {
+  return {
+    focal: [projection[0] * (width / 2), projection[5] * (height / 2)],
+    centre: [(width / 2) * (1 - projection[8]), (height / 2) * (1 + projection[9])],
+  };
+}
+
 /** Return whether two cameras see the same picture. */
 export function isSameView(a: Camera, b: Camera): boolean {
   const numbers = ({ width, height, focal, centre, pose }: Camera) =>

@@ -225,7 +225,7 @@ export class Renderer {
       const limits = merging && projection && merging.limits(screen, projection);
       const keeping = { role: 'frame', isExact: wanted.level === 'reference', limits };
       const job = new PictureJob(views[number], wanted, this.#presentation, keeping);
-      cost += job.raysPerPixel;
+      cost = job.raysPerPixel;
       job.march(this.#device, job.rowsLeft);
       const pictures = job.finish(this.#presentation);
       if (merging && projection && limits) merging.show(screen, pictures, limits, projection);

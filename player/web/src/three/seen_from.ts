@@ -1,7 +1,7 @@
 /** How a camera of three.js sees an object. */
 
 import { type Camera, Matrix4, type Object3D, Quaternion, SRGBColorSpace, Vector3, type WebGLRenderer } from 'three';
-import type { Camera as KpcCamera, Projection } from '../index.js';
+import { type Camera as KpcCamera, type Projection, pinholeOf } from '../index.js';
 
 /** From [-1, 1] to shares of the picture's size, and depths likewise. */
 const TO_SHARES = new Matrix4().set(0.5, 0, 0, 0.5, 0, 0.5, 0, 0.5, 0, 0, 0.5, 0.5, 0, 0, 0, 1);
@@ -59,18 +59,12 @@ function lensOf(
   width: number,
   height: number,
 ) {
-  const [across, along] = [p[0] * (width / 2), p[5] * (height / 2)];
-  if (p[15] === 0) {
-    return {
-      focal: [across, along],
-      centre: [(width / 2) * (1 - p[8]), (height / 2) * (1 + p[9])],
-      eye: new Vector3(),
-    };
-  }
+  if (p[15] === 0) return { ...pinholeOf(p, width, height), eye: new Vector3() };
+  const { focal } = pinholeOf(p, width, height);
   const middle = box.min.clone().add(box.max).multiplyScalar(0.5).applyMatrix4(toEye);
   const distance = FAR * box.min.distanceTo(box.max) * toEye.getMaxScaleOnAxis();
   return {
-    focal: [distance * across, distance * along],
+    focal: focal.map((length) => distance * length),
     centre: [width / 2, height / 2],
     eye: new Vector3(-p[12] / p[0], -p[13] / p[5], middle.z + distance),
   };

@@ -29,6 +29,7 @@ const ICONS = {
   settings:
     'M4 7h9M18 7h2M4 17h2M11 17h9M15.5 9.5a2.5 2.5 0 1 0 0-5 2.5 2.5 0 0 0 0 5zM8.5 19.5a2.5 2.5 0 1 0 0-5 2.5 2.5 0 0 0 0 5z',
   fill: 'M4 9V4h5M20 9V4h-5M4 15v5h5M20 15v5h-5',
+  headset: 'M3 8h18v9h-5.5L13.5 14.5h-3L8.5 17H3zM7 8V6h10v2',
   leave: 'M9 4v5H4M15 4v5h5M9 20v-5H4M15 20v-5h5',
 } as const;
 export type IconName = keyof typeof ICONS;

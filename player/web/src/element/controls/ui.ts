@@ -1,6 +1,7 @@
 /** What the player shows around the picture: poster, bar, panels and messages. */
 
 import type { Commands } from '../commands.js';
+import { isHeadsetThere } from '../headset/headset.js';
 import type { PlayerError } from '../messages.js';
 import { IconButton, make, Popup } from './dom.js';
 import { fillSettings, fillViews, keyList, type Model } from './panels.js';
@@ -83,7 +84,11 @@ export class Ui {
     const link = new IconButton('link', 'Copy link here and now', () => commands.copyLink(), {
       class: 'button secondary',
     });
-    const buttons = [views.button, settings.button, link, this.#fill].map(({ element }) => element);
+    const headset = new IconButton('headset', 'Watch in the headset', () => commands.toggleHeadset(), { hidden: true });
+    isHeadsetThere().then((isThere) => {
+      headset.element.hidden = !isThere;
+    });
+    const buttons = [views.button, settings.button, link, headset, this.#fill].map(({ element }) => element);
     this.#bar = make(
       'div',
       { class: 'bar', part: 'bar' },
