@@ -197,6 +197,17 @@ def test_understood_camera_models(tmp_path: Path, model: str | None) -> None:
     assert len(p) == 10 and p.is_fisheye.all() == p.is_fisheye.any() == ("FISHEYE" in (model or "").upper())
 
 
+def test_exports_of_polycam_and_record3d(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As nerfstudio converts them: each frame of Polycam has intrinsics of its own; those of Record3D share theirs."""
+    lens = {"fl_x": 50.0, "fl_y": 49.0, "cx": 15.0, "cy": 12.5, "w": 32, "h": 24}
+    folder = nerfstudio(tmp_path / "set", without(*lens, camera_model="OPENCV", orientation_override="none"))
+    make.edit_json(folder / "transforms.json", each(**lens, depth_file_path="./depths/frame_{}.png"))
+    np.testing.assert_array_equal(load(folder).pictures.intrinsics, [[50, 49, 15, 12.5]] * 10)
+    assert "depth_file_path" in (line := said(capsys)) and "orientation_override" in line
+    folder = nerfstudio(folder, each(file_path="images/{}.png"), camera_model="OPENCV")
+    assert len(load(folder).pictures) == 10 and not capsys.readouterr().err
+
+
 def test_fisheye_of_instant_ngp(tmp_path: Path) -> None:
     for keys in ({"is_fisheye": True}, {"is_fisheye": True, "camera_model": "OPENCV"}):
         p = load(nerfstudio(tmp_path / "set", **keys, distortion_params=[0.1, 0.01, 2e-3, 3e-3, 0, 0])).pictures

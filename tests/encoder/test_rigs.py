@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import datasets as make
 import rigs
 from datasets import fails, load, write_mask
 from kpc.encoder.datasets import Dataset, pixel_rays
@@ -179,7 +180,7 @@ def edited(folder: Path, layout: str, file: str, change: Any) -> Path:
 @pytest.mark.parametrize(
     "layout, file, change, words",
     [
-        ("panoptic", "calibration_dance.json", lambda d: d.update(cameras=[]), "lists no cameras"),
+        ("panoptic", "calibration_dance.json", lambda d: d.update(cameras={"distCoef": 1}), "lists no cameras"),
         ("panoptic", "calibration_dance.json", lambda d: d["cameras"][1].pop("t"), "camera 1: t is missing"),
         ("panoptic", "calibration_dance.json", lambda d: d["cameras"][1].update(name="00_01"), "no name of its own"),
         ("panoptic", "calibration_dance.json", lambda d: d["cameras"][1].update(R=[2, 0, 0] * 3), "scaled"),
@@ -222,7 +223,7 @@ def test_which_file_is_whose_is_never_guessed(tmp_path: Path) -> None:
     fails(tmp_path / "set", "none of its 3 cameras (cam0, cam1, cam2) has a video or images in videos/")
 
 
-def test_instants_go_by_numbers_else_by_order(tmp_path: Path) -> None:
+def test_instants_go_by_numbers_else_by_order(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Numbers of frames count; times of day, as in names of ZJU-MoCap, do not."""
     rigs.write_easymocap(tmp_path / "set", frames=4)
     (tmp_path / "set/images/01/000002.png").unlink()
@@ -235,7 +236,24 @@ def test_instants_go_by_numbers_else_by_order(tmp_path: Path) -> None:
     fails(tmp_path / "set", "01 has 3 images, 00 4", "name the images by their instants")
     (tmp_path / "set/images/00/Camera_2_2019-08-23_16-08-51.020.png").unlink()
     (tmp_path / "set/images/010/Camera_2_2019-08-23_16-08-51.020.png").unlink()
+    capsys.readouterr()
     assert load(tmp_path / "set").pictures.time.tolist() == [0, 0.5, 1] * 3
+    assert "do not number the instants, so that their order does" in capsys.readouterr().err
+
+
+def test_a_calibration_without_a_size_is_doubted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One for pictures of twice the size puts the principal point into a corner."""
+    rigs.write_opencv_json(tmp_path / "set")
+
+    def double(document: Any) -> None:
+        for camera in document["cameras"].values():
+            del camera["image_size"]
+            camera["camera_matrix"] = (2 * np.array(camera["camera_matrix"]) - np.diag([0, 0, 1])).tolist()
+
+    make.edit_json(tmp_path / "set/cameras.json", double)
+    (tmp_path / "set/cameras.json").rename(tmp_path / "set/calibration.json")
+    load(tmp_path / "set")
+    assert "the principal point of cam0 lies at 103% of the width and 94% of the height" in capsys.readouterr().err
 
 
 def test_several_recordings_are_refused(tmp_path: Path) -> None:

@@ -1,10 +1,10 @@
 """Fuzz the dataset loaders: `python -m kpc.tools.dev.fuzz_datasets --count 20000 --seed 1 -o found`.
 
-Tiny datasets of every layout are mutated: the values, keys and names of `transforms*.json`, the words and bytes of
-COLMAP's models, the numbers of `poses_bounds.npy`, and the files themselves. `load_dataset` must read the result or
-refuse it with a DatasetError or MediaError. Everything that it says must be printable lines, and of the media files
-each must be trained on, held out or left out. Anything else, and more than HANG_S of computing, are findings, whose
-datasets are written to -o. Dataset number N of a seed is always the same.
+Tiny datasets of every layout are mutated: the values, keys and names of JSON documents, the words of texts (COLMAP,
+YAML, TOML, XML), the bytes of COLMAP's models, the numbers of `poses_bounds.npy`, and the files themselves.
+`load_dataset` must read the result or refuse it with a DatasetError or MediaError. Everything that it says must be
+printable lines, and of the media files each must be trained on, held out or left out. Anything else, and more than
+HANG_S of computing, are findings, whose datasets are written to -o. Dataset number N of a seed is always the same.
 """
 
 import contextlib
@@ -36,12 +36,15 @@ from kpc.format.common.images import write_image
 from kpc.format.common.progress import progress
 from kpc.format.scene.camera_models import COLMAP_NUMBERS, PARAMETERS
 from kpc.tools.dev.fuzz_options import check_range, fuzz_parser
+from kpc.tools.dev.fuzz_rigs import rigs
 from kpc.tools.vectors.fuzz import scrambled
 
 HANG_S = 5.0  # seconds of processor time that count as a hang
 STUCK_S = 120.0  # seconds after which the process prints where it is and ends, since no exception gets through
 
 WIDTH, HEIGHT, CAMERAS = 8, 6, 5
+
+TEXTS = (".txt", ".yml", ".toml")  # suffixes of documents that are changed word by word
 
 HOLDOUTS = (None, None, None, "none", "1")  # what is asked to be held out, in turn
 
@@ -126,6 +129,7 @@ def seeds() -> list[Files]:
         images | _colmap_text("PINHOLE 8 6 9 9 4 3"),
         images | {"poses_bounds.npy": _array(_poses_bounds(CAMERAS, 1))},
         videos | {"poses_bounds.npy": _array(_poses_bounds(3, 2))},
+        *rigs(CAMERAS, WIDTH, HEIGHT, images),
     ]
 
 
@@ -242,7 +246,7 @@ def _places(value: Any) -> Iterator[tuple[Any, Any]]:
 
 def of_words(rng: random.Random, files: Files) -> None:
     """Replace, delete, repeat or exchange words and lines of a text file."""
-    name = _chosen(rng, files, ".txt")
+    name = rng.choice([name for name in files if name.endswith(TEXTS)])
     lines = [line.split(" ") for line in files[name].decode("utf-8", "replace").split("\n")]
     for _ in range(rng.choice((1, 1, 2, 3))):
         line = rng.choice(lines) if lines else []
@@ -340,7 +344,7 @@ def mutated(rng: random.Random, seed: Files) -> Files:
     while True:
         fit: list[Mutation] = [
             mutation
-            for suffix, mutation in ((".json", of_json), (".txt", of_words), (".npy", of_array), ("", in_bytes))
+            for suffix, mutation in ((".json", of_json), (TEXTS, of_words), (".npy", of_array), ("", in_bytes))
             if any(name.endswith(suffix) for name in files)
         ]
         weights = [6] * (len(fit) - 1) + [3] if fit else []
@@ -377,7 +381,8 @@ def examined(root: Path, cache: Path, holdout: str | None = None) -> str:
     if outcome == "read":
         pictures = dataset.pictures
         used = len(set(pictures.file))
-        found = len(media_in(root / "images" if (root / "images").is_dir() else root))
+        folder = next((root / name for name in ("images", "rgb/1x") if (root / name).is_dir()), root)
+        found = len(media_in(folder))
         if used + dataset.left_out != found:
             raise AssertionError(f"{used} trained on or held out and {dataset.left_out} left out of {found} found")
     return outcome

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from kpc.encoder.datasets.capture import Capture, first_names, natural_key, printable
+from kpc.encoder.datasets.layouts.calibration import RigCamera
 from kpc.encoder.datasets.layouts.caliscope import toml_camera
 from kpc.encoder.datasets.layouts.documents import read_toml
 from kpc.encoder.datasets.layouts.rig_media import read_rig
@@ -19,8 +20,8 @@ from kpc.format.common.errors import DatasetError
 # The layout's name in messages.
 NAME = "Anipose"
 
-# Names of calibrations, in any case, and the folders in which they lie.
-PREFIXES, FOLDERS = ("calib",), (".", "calibration")
+# A part of the names of calibrations, in any case, and the folders in which they lie.
+PART, FOLDERS = "calib", (".", "calibration")
 
 
 def recognise(path: Path) -> bool:
@@ -40,7 +41,7 @@ def read(path: Path, holdout: str | None) -> Capture:
     tables = {key: table for key, table in read_toml(file).items() if key != "metadata" and isinstance(table, dict)}
     if not tables:
         raise DatasetError(f"{file}: has no cameras; calibrate the rig first")
-    cameras = []
+    cameras: list[RigCamera] = []
     for key, table in tables.items():
         where, name = f"{file} {printable(key)}", table.get("name", key)
         if not isinstance(name, str) or not name or name in [camera.name for camera in cameras]:
@@ -58,4 +59,4 @@ def _refuse_offset(where: str, table: dict[str, Any]) -> None:
 
 def _files(path: Path) -> list[Path]:
     found = [f for folder in FOLDERS for f in (path / folder).glob("*.toml") if f.is_file()]
-    return sorted((f for f in found if f.name.lower().startswith(PREFIXES)), key=lambda f: natural_key(f.name))
+    return sorted((f for f in found if PART in f.name.lower()), key=lambda f: natural_key(f.name))

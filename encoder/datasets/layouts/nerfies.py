@@ -137,9 +137,9 @@ def _instants(file: Path, names: list[str]) -> dict[str, float]:
         return {}
     document, instants = _object(file), {}
     for name in names:
-        keys = document.get(name)
-        where = f"{file} {printable(name)}"
-        key = next((key for key in _TIMES if isinstance(keys, dict) and key in keys), None)
+        where, keys = f"{file} {printable(name)}", document.get(name)
+        keys = keys if isinstance(keys, dict) else {}
+        key = next((key for key in _TIMES if key in keys), None)
         if key is None:
             raise DatasetError(f"{where}: has no warp_id, so its instant is unknown; add it or remove the file")
         instants[name] = number_of(where, keys, key)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from kpc.encoder.datasets.capture import Capture, natural_key, printable
+from kpc.encoder.datasets.layouts import panoptic
 from kpc.encoder.datasets.layouts.calibration import RigCamera, opencv_camera, rotation, size_of
 from kpc.encoder.datasets.layouts.documents import MAX_BYTES, read_json, read_yaml
 from kpc.encoder.datasets.layouts.rig_media import read_rig
@@ -46,7 +47,7 @@ NAMES = {
 _KEYS = re.compile(r"[\"']?(\w+)[\"']?\s*:")
 
 # Documents of other layouts.
-_OTHERS = re.compile(r"(transforms|calibration)_?.*\.json|(intri|extri)\.yml", re.IGNORECASE)
+_OTHERS = re.compile(r"transforms.*\.json|(intri|extri)\.yml", re.IGNORECASE)
 
 _SAME_ROTATION = 1e-4  # how much two forms of a rotation may differ
 
@@ -82,7 +83,7 @@ def _files(path: Path) -> Iterator[Path]:
             if file.suffix.lower() not in SUFFIXES or _OTHERS.fullmatch(file.name) or not file.is_file():
                 continue
             looked_at += 1
-            if looked_at > _MOST_FILES or file.stat().st_size > MAX_BYTES:
+            if looked_at > _MOST_FILES or file.stat().st_size > MAX_BYTES or panoptic.is_calibration(file):
                 continue
             with open_text(file) as text:
                 keys = {_plain(key) for key in _KEYS.findall(text.read())}

@@ -10,10 +10,11 @@ import sys
 from pathlib import Path
 
 from kpc.encoder.datasets.capture import Capture, first_names, natural_key, printable
-from kpc.encoder.datasets.layouts.calibration import opencv_camera, size_of
+from kpc.encoder.datasets.layouts.calibration import RigCamera, opencv_camera, size_of
 from kpc.encoder.datasets.layouts.documents import MAX_BYTES, read_json
 from kpc.encoder.datasets.layouts.rig_media import read_rig
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import open_text
 
 # The layout's name in messages.
 NAME = "Panoptic Studio"
@@ -52,7 +53,7 @@ def read(path: Path, holdout: str | None) -> Capture:
     if len(types) > 1:
         rest = first_names([other for other in types if other != kind])
         print(f"{file}: the cameras of type {printable(kind)} are read, not those of type {rest}", file=sys.stderr)
-    cameras = []
+    cameras: list[RigCamera] = []
     for number, keys in enumerate(listed):
         where, name = f"{file} camera {number}", keys.get("name")
         if str(keys.get("type", "hd")) != kind:
@@ -65,5 +66,14 @@ def read(path: Path, holdout: str | None) -> Capture:
     return read_rig(path, NAME, file, cameras, folders, holdout)
 
 
+def is_calibration(file: Path) -> bool:
+    """Return whether a document is one of the studio's: it lists cameras with `distCoef`."""
+    if not (file.match("calibration_*.json") and file.is_file() and file.stat().st_size <= MAX_BYTES):
+        return False
+    with open_text(file) as text:
+        content = text.read()
+    return '"distCoef"' in content and '"cameras"' in content
+
+
 def _files(path: Path) -> list[Path]:
-    return sorted((f for f in path.glob("calibration_*.json") if f.is_file()), key=lambda f: natural_key(f.name))
+    return sorted(filter(is_calibration, path.glob("calibration_*.json")), key=lambda f: natural_key(f.name))

@@ -37,6 +37,9 @@ from kpc.format.common.media_files import is_hidden, is_video
 # What precedes the number of a camera in names of files.
 _PREFIX = re.compile(r"(camera|cam|port|view|hd|vga|kinect|video)[-_ ]*", re.IGNORECASE)
 
+# A principal point that is farther from the middle of a picture, as a share of its sides, is doubted.
+FAR_OFF = 0.25
+
 # Parts of names with at least so many characters are serial numbers.
 _SERIAL = 4
 
@@ -101,10 +104,11 @@ def read_rig(
     for camera, some, is_test in zip(used, times, tests, strict=True):
         own = _views(camera, media[camera.name], some, is_test)
         views += own if masks is None else [_with_foreground(masks, view) for view in own]
+    _report_centres(file, views)
     if masks is not None:
         without = [view.file.name for view in views if view.foreground is None]
-        some = f", but {len(without)} of {len(views)} pictures have none: {first_names(without)}" if without else ""
-        print(f"{masks}: masks of the foreground, without which pictures are transparent{some}", file=sys.stderr)
+        lack = f"; {len(without)} of {len(views)} pictures have none: {first_names(without)}" if without else ""
+        print(f"{masks}: masks of the foreground; what they leave out is transparent{lack}", file=sys.stderr)
     return Capture(layout, tuple(views), None, tuple(found))
 
 
@@ -221,6 +225,11 @@ def _times(root: Path, media: Sequence[Media]) -> list[list[float | None]]:
                 f"{root}: {printable(fewest)} has {min(counts)} images, {printable(most)} {max(counts)}, and their "
                 "names do not number the instants; name the images by their instants, such as 000000.jpg"
             )
+        print(
+            f"{root}: the names of images do not number the instants, so that their order does: the first of each "
+            "camera, the second of each, and so on",
+            file=sys.stderr,
+        )
         frames = [list(range(count)) for count in counts]
     numbers = [number for some in frames if some is not None for number in some]
     first, last = min(numbers), max(numbers)
@@ -248,6 +257,19 @@ def _views(camera: RigCamera, media: Media, times: Sequence[float | None], is_te
         replace(image_view(image, where, lens, pose, time=time, is_test=is_test), camera=camera.name)
         for image, time in zip(media.images, times, strict=True)
     ]
+
+
+def _report_centres(file: Path, views: Sequence[CapturedView]) -> None:
+    """Say in one line if a principal point is far from the middle, as that of a calibration for other pictures is."""
+    for view in views:
+        cx, cy = view.intrinsics[2] / view.width, view.intrinsics[3] / view.height
+        if max(abs(cx - 0.5), abs(cy - 0.5)) > FAR_OFF:
+            print(
+                f"{file}: the principal point of {printable(view.camera or '')} lies at {cx:.0%} of the width and "
+                f"{cy:.0%} of the height of its pictures; if it was calibrated at another size, say so there",
+                file=sys.stderr,
+            )
+            return
 
 
 def _with_foreground(masks: Path, view: CapturedView) -> CapturedView:
