@@ -1,8 +1,10 @@
 """Quantisation that lands where a trade says."""
 
 import math
+import pickle
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,8 +33,21 @@ from kpc.format.coding.quantise import QuantisedScene, quantise_scene, round_dec
 from kpc.format.scene.scene import Scene
 from scenes import tiny_scene
 
-# On the trellis alone, which is quicker: how modes are chosen is tested in test_mode_decision.py.
-quantise_by_cost = partial(mode_decision.quantise_by_cost, block_sides=())
+# Quantised scenes by the arguments that they were made of: the searches of many tests begin with the same steps.
+KNOWN: dict[bytes, QuantisedScene] = {}
+
+
+def quantise_by_cost(*args: Any) -> QuantisedScene:
+    """Quantise on the trellis alone, which is quicker, and the same arguments once.
+
+    How modes are chosen is tested in test_mode_decision.py.
+    """
+    key = pickle.dumps(args)
+    if key not in KNOWN:
+        KNOWN[key] = mode_decision.quantise_by_cost(*args, block_sides=())
+    return KNOWN[key]
+
+
 controller = partial(RateController, quantise=quantise_by_cost)
 
 
