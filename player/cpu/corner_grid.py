@@ -84,13 +84,6 @@ class CornerGrid(FieldSampler):
         known = self._known[worker].reshape(-1)
         return CornerGridArrays(grid, known, self._planes, self._rows, self._scaled_weights, bias), None
 
-    @staticmethod
-    def dummy_arrays(scene: Scene) -> FieldArrays:
-        planes = (np.zeros((1, WIDE), np.int16),) * len(SPACE_PLANES)
-        rows = (np.zeros((1, WIDE), np.float32),) * len(TIME_PLANES)
-        grid, known = Grid(np.zeros((1, 4), np.float32), (1, 1, 1)), np.zeros(1, np.uint8)
-        return CornerGridArrays(grid, known, planes, rows, np.zeros((4, WIDE), np.float32), np.float32(0)), None
-
     def _rows_at(self, time: float) -> tuple[np.ndarray, ...]:
         """Return the rows of all scales at a time, at corners, along x, y and z: (N, M) each. Keeps what was made of
         the two rows in time around it for the next picture."""

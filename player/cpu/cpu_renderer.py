@@ -5,7 +5,6 @@ A picture follows the one before if it can (`kpc.player.cpu.reprojection`); else
 cell projects to are left out (`kpc.player.cpu.screen_mask`).
 """
 
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -16,7 +15,7 @@ from kpc.format.scene.scene import Scene
 from kpc.player.atlas import Layout, empty_distances
 from kpc.player.cpu.coarse_to_fine import FACTOR, blocks_over, interpolation_errors, upsample
 from kpc.player.cpu.corner_grid import CornerGrid
-from kpc.player.cpu.field_sampler import FieldSampler, warm_up
+from kpc.player.cpu.field_sampler import FieldSampler
 from kpc.player.cpu.occupancy_culling import OccupancyCulling
 from kpc.player.cpu.picture import BLOCK, Picture, Rectangle, union
 from kpc.player.cpu.plane_sampler import PlaneSampler
@@ -128,11 +127,6 @@ class ProcessorRenderer:
     @property
     def picture_bytes(self) -> int:
         return sum(array.nbytes for picture in self._pictures.values() for array in picture)
-
-    def warm_up(self, quality: Quality) -> None:
-        """Compile the march in a thread, before a picture waits for it."""
-        kind = self._sampler_kind(quality, self.scene.is_dynamic)
-        threading.Thread(target=warm_up, args=(kind, self.scene), name="warming up", daemon=True).start()
 
     def planes_changed(self) -> None:
         """Read the space planes anew before the next picture."""

@@ -85,11 +85,6 @@ class FieldSampler(ABC):
     def _arrays(self, worker: int) -> FieldArrays:
         """Return what `march_blocks` is to sample, for one of the workers."""
 
-    @staticmethod
-    @abstractmethod
-    def dummy_arrays(scene: Scene) -> FieldArrays:
-        """Return arrays of the same types as `_arrays`, of hardly any size."""
-
     def march(
         self,
         camera: Camera,
@@ -129,17 +124,6 @@ class FieldSampler(ABC):
             )
 
         from_both_ends(work, len(blocks), PIXELS_AT_ONCE // side**2)
-
-
-def warm_up(kind: type[FieldSampler], scene: Scene) -> None:
-    """Compile `march_blocks` for a sampler and scene, which takes five seconds, or load it: march no block of a picture
-    of one pixel."""
-    camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))
-    picture = Picture.empty((1, 1))
-    view, settings, even = view_of(scene, camera), march_settings(scene, 1.0, 0.5), uniform_distance_of(scene)
-    occupancy, no_blocks = Occupancy(np.zeros(1, np.uint8), (1, 1, 1)), np.zeros((0, 2), np.int64)
-    arrays = kind.dummy_arrays(scene)
-    march_blocks(no_blocks, 1, view, settings, even, occupancy, _no_motion(), *arrays, picture)
 
 
 def view_of(scene: Scene, camera: Camera) -> View:

@@ -97,14 +97,6 @@ class PlaneSampler(FieldSampler):
         )
         log_densities_at(positions, self._motion, density_only, out)
 
-    @staticmethod
-    def dummy_arrays(scene: Scene) -> FieldArrays:
-        flat, table, indices = np.zeros(1, np.float32), np.zeros((1, 1), np.float32), np.zeros((1, 1), np.int64)
-        return None, PlaneArrays(
-            tuple(range(0, group_width(scene), NARROW)), np.zeros(1, np.int16), flat, indices, indices,
-            table, flat, table, flat, np.float32(0), table,
-        )  # fmt: skip
-
     def _put(self, into: np.ndarray, scale: int, which: int, texels: np.ndarray) -> None:
         """Write (..., channels) texels of a plane or row to their place, group by group."""
         for number, group in enumerate(range(self._first_group[scale], self._first_group[scale + 1])):

@@ -139,8 +139,6 @@ class Renderer:
 
         self._waits_for_processor = False
         self._processor = ProcessorRenderer(self.scene, self.layout, self._textures.read_atlas)
-        if self.quality.folded:
-            self._processor.warm_up(self.quality)
 
     def _drawing_processor(self) -> "ProcessorRenderer | None":
         """Return the processor's renderer if it draws at this quality."""

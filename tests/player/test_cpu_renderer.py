@@ -10,10 +10,9 @@ import gl
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
 from kpc.player.cpu.corner_grid import CornerGrid
-from kpc.player.cpu.field_sampler import quantised_planes, warm_up
+from kpc.player.cpu.field_sampler import quantised_planes
 from kpc.player.cpu.lanes import FAST, clamped
 from kpc.player.cpu.plane_sampler import PlaneSampler
-from kpc.player.cpu.raymarch import march_blocks
 from kpc.player.cpu.reference import Part, render
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LEVELS, Quality
@@ -193,14 +192,3 @@ def test_its_memory_is_counted() -> None:
         assert taken == bound or (not scene.decoder.w2.any() and taken < bound)
         assert renderer.memory_bytes >= before + bound
         assert renderer.memory_bytes - renderer.picture_bytes <= Renderer.bytes_for(scene)
-
-
-@pytest.mark.parametrize("kind", [PlaneSampler, CornerGrid])
-def test_no_picture_compiles_anything_after_warming_up(kind: type) -> None:
-    """Whether or not anything is displaced, colours have sides or something moves."""
-    for scene in [make() for make in SCENES.values()] if kind is PlaneSampler else [unequal_scales(), one_texel_deep()]:
-        warm_up(kind, scene)
-        before = list(march_blocks.signatures)
-        for shown in (scene, with_motion(scene)) if scene.is_dynamic else (scene,):
-            renderer_of(shown, kind).render(CAMERA, 0.3)
-        assert march_blocks.signatures == before

@@ -26,12 +26,15 @@ from kpc.player.cpu import (
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import DEFAULT, LEVELS
 from processor import psnr
-from scenes import VARIANTS, look_at, tiny_scene
+from scenes import VARIANTS, look_at, one_texel_deep, tiny_scene, unequal_scales, view_independent
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
 MODULES = coarse_to_fine, field_kernels, lanes, raymarch, reprojection
 # Shaders keep folded planes in float16. Other levels leave out what is hardly seen in a scene, and is in random planes.
 LEVEL, AGREEMENT_DB = LEVELS["finer"], 45.0
+SCENES = {name: variant(tiny_scene(4)) for name, variant in VARIANTS.items()}
+SCENES |= {"unequal scales": unequal_scales(), "one texel along z": one_texel_deep()}
+SCENES |= {"one-sided": view_independent(tiny_scene(4)), "static": tiny_scene(4, dynamic=False)}
 
 
 @pytest.fixture
@@ -120,9 +123,9 @@ def test_threads_do_not_compile_where_only_cached_kernels_may_be_used() -> None:
 
 
 @pytest.mark.usefixtures("unloaded")
-@pytest.mark.parametrize("variant", [name for name in VARIANTS if serving.serves(VARIANTS[name](tiny_scene(4)))])
-def test_warming_up_leaves_nothing_to_compile(variant: str) -> None:
-    scene = VARIANTS[variant](tiny_scene(4))
+@pytest.mark.parametrize("name", [name for name, scene in SCENES.items() if serving.serves(scene)])
+def test_warming_up_leaves_nothing_to_compile(name: str) -> None:
+    scene = SCENES[name]
     loading.load(scene)
     renderer, before = Renderer(gl.context(), scene, processor=True), signatures(MODULES)
     for renderer.quality in (quality for quality in LEVELS.values() if quality.folded):
