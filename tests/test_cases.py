@@ -3,12 +3,16 @@
 The scripts that make them lie beside the repository in shared/cases, one folder each.
 """
 
+import functools
+import importlib
 import os
+import runpy
 import socket
 import subprocess
 import sys
 import time as clock
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,10 +74,25 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
     return Clip(folder, load_dataset(folder, tmp_path_factory.mktemp("cache"), progress=False))
 
 
+@pytest.fixture(scope="module")
+def decoded_once() -> Iterator[None]:
+    """Have the scripts decode each film of the clip once: most make pictures of its frames."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(CASES)
+        common = importlib.import_module("common")
+        patch.setattr(common, "frames", functools.cache(common.frames))
+        yield
+    del sys.modules["common"]
+
+
 def run_script(name: str, clip: Clip, out: Path) -> None:
-    """Run the script of a case in `out`."""
+    """Run the script of a case in `out`, in this process."""
     script = CASES / name / "make.py"
-    subprocess.run([sys.executable, "-B", script, clip.folder, out], cwd=out, check=True, timeout=120)
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(action="ignore"):
+        patch.chdir(out)
+        patch.setattr(sys, "argv", [str(script), str(clip.folder), str(out)])
+        patch.setattr(sys, "path", [*sys.path])
+        runpy.run_path(str(script))
 
 
 Check = Callable[[Dataset, Clip], None]
@@ -303,6 +322,7 @@ EXPECTED: dict[str, Outcome] = {
 FOLDERS = sorted(path.name for path in CASES.iterdir() if (path / "case.md").is_file()) if CASES.is_dir() else []
 
 
+@pytest.mark.usefixtures("decoded_once")
 @pytest.mark.parametrize("name", [name for name in FOLDERS if name not in ELSEWHERE])
 def test_a_case(name: str, clip: Clip, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert name in EXPECTED, f"shared/cases/{name} has no expectation here; add it to EXPECTED"
