@@ -11,6 +11,7 @@ import datasets as make
 import rigs
 from datasets import fails, load, write_mask
 from kpc.encoder.datasets import Dataset, pixel_rays
+from kpc.encoder.datasets.capture import fits
 from rigs import CAMERAS, HEIGHT, POINTS, WIDTH, WRITERS
 
 # Pixels by which rays may miss the points: float32 at a focal length of 48 and a distance of 3.
@@ -129,6 +130,20 @@ def test_calibrations_of_another_raster_are_scaled(tmp_path: Path, size: tuple[i
     assert max(missed(load(tmp_path / "set"), n, n // 2, False) for n in range(6)) < MISSED
 
 
+@pytest.mark.parametrize(
+    "declared, actual, expected",
+    [
+        ((1920, 1088), (1920, 1080), False),  # the coded rows of H.264, of which 8 are cropped
+        ((1080, 1920), (1088, 1920), False),
+        ((1088, 1934), (1080, 1920), True),  # 1919.8 rows
+        ((4946, 3286), (1237, 822), True),  # a quarter, rounded up
+        ((640, 480), (480, 640), False),
+    ],
+)
+def test_rounding_of_sizes(declared: tuple[float, float], actual: tuple[int, int], expected: bool) -> None:
+    assert fits(declared, actual) == expected
+
+
 def test_another_aspect_ratio_is_refused(tmp_path: Path) -> None:
     """Coded pictures of 1088 rows are cropped to 1080, not scaled."""
     rigs.write_easymocap(tmp_path / "set", W_00=1920, H_00=1096)
@@ -150,6 +165,7 @@ BAD_YAML: list[tuple[str, str, str, str]] = [
     ("extri.yml", "names", "\x00", "not YAML"),
     ("intri.yml", "%YAML:1.0", "[" * 5000, "not YAML"),
     ("extri.yml", "", "- a list", "holds no cameras"),
+    ("extri.yml", "", "# a very long comment\n" * 30000, "larger than 512 KiB"),
 ]
 
 

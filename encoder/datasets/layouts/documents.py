@@ -18,8 +18,9 @@ from kpc.encoder.datasets.capture import printable
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.text import open_text
 
-# The largest file of calibrations, in bytes: two hundred cameras take a tenth of it.
-MAX_BYTES = 2 << 20
+# The largest file of calibrations, in bytes, and the largest of YAML, of which PyYAML parses 40 KB a second at worst.
+# Two hundred cameras take 60 to 100 KB.
+MAX_BYTES, MAX_YAML_BYTES = 2 << 20, 512 << 10
 
 # The first line that OpenCV writes is no directive of YAML.
 _OPENCV_DIRECTIVE = re.compile(r"\A%YAML:1\.[0-9]+[^\n]*\n")
@@ -46,7 +47,7 @@ def read_yaml(file: Path) -> Any:
     def parse(text: str) -> Any:
         return yaml.load(_OPENCV_DIRECTIVE.sub("", text), _TextLoader)  # a BaseLoader makes nothing but texts
 
-    return _parsed(file, "YAML", MAX_BYTES, parse)
+    return _parsed(file, "YAML", MAX_YAML_BYTES, parse)
 
 
 def read_toml(file: Path) -> dict[str, Any]:
@@ -77,7 +78,7 @@ def read_xml(file: Path) -> ElementTree.Element:
 
 def _parsed(file: Path, kind: str, max_bytes: int | None, parse: Callable[[str], Any]) -> Any:
     if max_bytes is not None and file.stat().st_size > max_bytes:
-        raise DatasetError(f"{file}: larger than {max_bytes >> 20} MiB, so it is no calibration; export it anew")
+        raise DatasetError(f"{file}: larger than {max_bytes >> 10} KiB, so it is no calibration; export it anew")
     try:
         with open_text(file) as text:
             return parse(text.read())
