@@ -70,6 +70,18 @@ def test_times_names_and_held_out_cameras(tmp_path: Path) -> None:
     ]
 
 
+def test_videos_of_one_name_in_the_folders_of_their_cameras(tmp_path: Path) -> None:
+    rigs.write_opencv_json(tmp_path / "set")
+    rigs.write_videos(tmp_path / "set/videos", ["cam0", "cam1", "cam2"])
+    for k in range(3):
+        (tmp_path / f"set/cam{k}.png").unlink()
+        (tmp_path / f"set/videos/cam{k}").mkdir()
+        (tmp_path / f"set/videos/cam{k}.mp4").rename(tmp_path / f"set/videos/cam{k}/video.mp4")
+    p = load(tmp_path / "set", holdout="cam1").pictures
+    assert p.file == tuple(f"videos/cam{k}/video.mp4" for k in (0, 0, 1, 1, 2, 2))
+    assert p.is_test.tolist() == [False, False, True, True, False, False]
+
+
 def test_masks_of_easymocap_are_alpha(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Elsewhere what a mask leaves out is not trained on; here it is the background, which is known to be nothing."""
     rigs.write_easymocap(tmp_path / "set")

@@ -98,7 +98,7 @@ def read_rig(
     is_still = not any(len(some) > 1 for some in times) and all(media[c.name].images for c in used)
     default = [k % HOLD_OUT_EVERY == 0 if is_still else k == 0 for k in range(len(used))]
     if holdout in media:
-        holdout = media[holdout].path.name
+        holdout = str(media[holdout].path.relative_to(root))
     tests = holdout_flags(root, [str(path.relative_to(root)) for path in paths], holdout, default)
     views: list[CapturedView] = []
     for camera, some, is_test in zip(used, times, tests, strict=True):
