@@ -1,12 +1,20 @@
 """Tiny sounds for tests, made by libav: tones that rise, and clicks whose place can be measured."""
 
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 
+from kpc.encoder.coding.scene_writer import encode
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.container import groups
+from kpc.format.container.clip_sound import sample_at
+from kpc.format.container.groups import GroupInput
+from kpc.format.scene.scene import Clip
 from kpc.format.scene.sound import SAMPLE_RATE, Sound
+from scenes import tiny_scene
 
 
 def sweep(seconds: float, low: float = 300.0, high: float = 3000.0, level: float = 0.3) -> np.ndarray:
@@ -78,3 +86,16 @@ def offset_of(found: np.ndarray, expected: np.ndarray, most: int = 4000) -> int:
     product = np.fft.rfft(found, size) * np.fft.rfft(expected, size).conj()
     correlation = np.fft.irfft(product, size)
     return int(np.argmax(np.concatenate([correlation[-most:], correlation[:most]]))) - most
+
+
+def scene_with_sound(sound: Sound, first: int, count: int) -> bytes:
+    """Return a tiny scene of some frames of a clip of 10 fps, with their part of a sound."""
+    scene = tiny_scene(scales=1, channels=2, resolution=(6, 5, 4), time=5)
+    part = sound.part(sample_at(first, 10.0), sample_at(count, 10.0))
+    scene = replace(scene, sound=part, clip=Clip(count, 10.0))
+    return encode(quantise_scene(scene, [dict.fromkeys(scene.scales[0], 0.05)]))
+
+
+def write_clip_with_sound(path: Path, sound: Sound) -> None:
+    """Write a clip of 4 s in two groups, which share four frames in its middle."""
+    groups.write([GroupInput.of(scene_with_sound(sound, first, 22), first) for first in (0, 18)], path)

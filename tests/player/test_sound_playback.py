@@ -1,18 +1,14 @@
 """The sound of the player: samples of a clip, and a clip that follows the clock of a device."""
 
 import threading
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from kpc.encoder.coding.opus import encode_sound
-from kpc.encoder.coding.scene_writer import encode
-from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import FormatError, MediaError
-from kpc.format.container.clip_sound import sample_at
-from kpc.format.container.groups import GroupInput, Groups, write
+from kpc.format.container.groups import Groups
 from kpc.format.container.sources import open_source
 from kpc.format.scene.scene import Clip
 from kpc.format.scene.sound import SAMPLE_RATE
@@ -21,8 +17,7 @@ from kpc.player.sharing.file_server import Handler, serving
 from kpc.player.sound import device
 from kpc.player.sound.clip_samples import ClipSamples
 from kpc.player.sound.playback import AHEAD_S, APART_S, SoundPlayback
-from scenes import tiny_scene
-from sounds import decoded, sweep
+from sounds import decoded, scene_with_sound, sweep, write_clip_with_sound
 
 pytest.importorskip("soundfile")
 
@@ -200,16 +195,10 @@ def test_a_file_that_cannot_be_read_ends_the_sound_but_not_the_clip():
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> tuple[bytes, str, np.ndarray]:
     """Return a scene of 4 s with sound, a clip in two groups of it, and the samples of the scene."""
-    scene = tiny_scene(scales=1, channels=2, resolution=(6, 5, 4), time=5)
     sound = encode_sound(sweep(5.0)[:, None])
-    halves = []
-    for first, count in ((0, 40), (0, 22), (18, 22)):
-        part = sound.part(sample_at(first, 10.0), sample_at(count, 10.0))
-        one = replace(scene, sound=part, clip=Clip(count, 10.0))
-        halves.append(encode(quantise_scene(one, [dict.fromkeys(one.scales[0], 0.05)])))
     path = tmp_path_factory.mktemp("clip") / "clip.kpc"
-    write([GroupInput.of(halves[1], 0), GroupInput.of(halves[2], 18)], path)
-    return halves[0], str(path), decoded(sound)[:, 0]
+    write_clip_with_sound(path, sound)
+    return scene_with_sound(sound, 0, 40), str(path), decoded(sound)[:, 0]
 
 
 def test_samples_of_a_file_are_those_of_a_decoder_that_never_stopped(files):

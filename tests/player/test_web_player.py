@@ -18,6 +18,7 @@ import pytest
 from PIL import Image
 
 import kpc
+from kpc.encoder.coding.opus import encode_sound
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.images import linear_from_srgb, srgb_from_linear
 from kpc.format.container import groups
@@ -25,11 +26,13 @@ from kpc.format.container.groups import GroupInput
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
+from kpc.format.scene.sound import SAMPLE_RATE
 from kpc.player.app.controls import OrbitView
 from kpc.player.cpu.reference import render, render_rays
 from kpc.player.sharing.file_server import Handler, Link, serving
 from kpc.player.viewpoints import presets
 from kpc.tools.bench import web_page
+from sounds import decoded, sweep, write_clip_with_sound
 
 SAMPLE = Path(__file__).parent.parent.parent / "samples" / "default.kpc"
 SCRIPT = web_page.WEB / "tests" / "element_browser.mjs"
@@ -94,6 +97,10 @@ class Faulty(Handler):
         super().send(file, count)
 
 
+# Four seconds on both sides; the clip is in two groups, of which the second takes over after two.
+RECORDING = encode_sound(np.stack([sweep(5.0), sweep(5.0, 3000.0, 200.0)], axis=1))
+
+
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Serve the built player, scenes and files that are none."""
@@ -106,6 +113,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     (folder / "scene.kpc").write_bytes(data)
     for name, count in ("long.kpc", 3), ("other.kpc", 4):
         groups.write([GroupInput.of(data, 30 * number) for number in range(count)], folder / name)
+    write_clip_with_sound(folder / "sound.kpc", RECORDING)
     (folder / "text.kpc").write_text("<!doctype html><title>Not here</title>" * 9)
     (folder / "draft.kpc").write_bytes(data[:10] + bytes(2) + data[12:])
     (folder / "half.kpc").write_bytes(data[:40_000] + bytes(len(data) - 40_000))
@@ -263,3 +271,22 @@ def test_meshes_of_three_hide_and_are_hidden(name: str, results: dict[str, Any])
     # Edges of squares, of which "target" has smooth ones, are all that is off.
     assert np.mean(error <= 2 / 255) >= (0.95 if name == "target" else 0.98)
     assert psnr(picture, wanted) >= (27 if name == "target" else 34)
+
+
+def test_the_sound_is_that_of_the_recording(results: dict[str, Any]) -> None:
+    started = results["plays the sound once the user has done something"]["value"]
+    recording, blocks = decoded(RECORDING)[: round(3.9 * SAMPLE_RATE)], list[int]()
+    expected = [recording[first : first + SAMPLE_RATE] for first in range(0, len(recording), SAMPLE_RATE)]
+    due = 0
+    for one in started:
+        found = np.frombuffer(base64.b64decode(one["samples"]), "<f4").reshape(2, -1).T
+        errors = [np.abs(found - each).max() if found.shape == each.shape else np.inf for each in expected]
+        assert min(errors) < 0.005  # where groups change, too
+        blocks.append(int(np.argmin(errors)))
+        if one["offset"] == 0 and len(blocks) > 1:
+            assert abs(one["at"] - due) < 1e-3 and blocks[-1] == (blocks[-2] + 1) % len(expected)
+        else:  # it began with the clip
+            began_s = blocks[-1] + one["offset"] / SAMPLE_RATE
+            assert abs(began_s - one["currentTime"]) < 0.3
+        due = one["at"] + len(found) - one["offset"]
+    assert set(blocks) == set(range(len(expected)))

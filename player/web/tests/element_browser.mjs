@@ -418,6 +418,55 @@ scenario('leaves nothing behind over 50 mounts', async () => {
   await close(page);
 });
 
+scenario('plays the sound once the user has done something', async () => {
+  const page = await open(TAG.replace('scene.kpc', 'sound.kpc').replace('muted', 'autoplay loop'), {
+    before: (it) =>
+      it.addInitScript(() => {
+        globalThis.started = [];
+        globalThis.AudioContext = class extends AudioContext {
+          constructor(...args) {
+            super(...args);
+            globalThis.context = this;
+            // As where a page plays by itself; the player resumes after a gesture.
+            this.onstatechange = () => this.isPermitted || this.suspend();
+          }
+          resume() {
+            this.isPermitted = true;
+            return super.resume();
+          }
+        };
+        const { start } = AudioBufferSourceNode.prototype;
+        AudioBufferSourceNode.prototype.start = function (at, offset) {
+          const { currentTime } = document.querySelector('kpc-player');
+          globalThis.started.push({ at, offset, currentTime, buffer: this.buffer });
+          start.call(this, at, offset);
+        };
+      }),
+  });
+  await until(page, (it) => it.currentTime > 0.1 && globalThis.context?.state === 'suspended');
+  await button(page, 'Sound on').click();
+  await button(page, 'Sound off').waitFor();
+  await page.waitForFunction(() => globalThis.started.length > 4, null, { timeout: 40_000 });
+  const value = await page.evaluate(() =>
+    globalThis.started.map(({ at, offset, currentTime, buffer }) => {
+      const bytes = [0, 1].flatMap((side) => [...new Uint8Array(buffer.getChannelData(side).slice().buffer)]);
+      const samples = btoa(bytes.map((byte) => String.fromCharCode(byte)).join(''));
+      return { at: at * 48000, offset: offset * 48000, currentTime, samples };
+    }),
+  );
+  await inside(page, '.stage').press('m');
+  assert.equal(await player(page, (it) => it.muted), true);
+  await button(page, 'Sound on').waitFor();
+  await player(page, (it) => {
+    it.volume = 0.5;
+    it.muted = false;
+  });
+  await button(page, 'Sound off').waitFor();
+  await until(page, (it) => it.shadowRoot.querySelector('.volume').ariaValueText === '50 %');
+  await close(page);
+  return value;
+});
+
 const WRONG = {
   'no-such.kpc': ['not-found', /no such file/],
   'text.kpc': ['foreign', /not a \.kpc file/],
@@ -568,7 +617,11 @@ const WHOLE =
 for (const [name, context] of Object.entries(SCREENS)) {
   scenario(`fits the screen: ${name}`, async () => {
     const direction = name === 'portrait' ? 'rtl' : 'ltr';
-    const page = await open(WHOLE + TAG.replace('quality="fastest"', `dir="${direction}"`), {
+    const tag = TAG.replace('quality="fastest"', `dir="${direction}"`).replace(
+      'scene.kpc',
+      name === 'desktop' ? 'scene.kpc' : 'sound.kpc',
+    );
+    const page = await open(WHOLE + tag, {
       context,
       isPlain: true,
     });
@@ -576,7 +629,7 @@ for (const [name, context] of Object.entries(SCREENS)) {
     await button(page, 'Settings').click();
     const { width, height } = context.viewport;
     const boxes = await player(page, (it) => {
-      const targets = [...it.shadowRoot.querySelectorAll('button, label, .timeline input')];
+      const targets = [...it.shadowRoot.querySelectorAll('button, label, input[type=range]')];
       const boxOf = (target) => ({
         label: target.ariaLabel ?? target.textContent,
         ...target.getBoundingClientRect().toJSON(),
@@ -588,6 +641,8 @@ for (const [name, context] of Object.entries(SCREENS)) {
       assert.ok(box.width >= 44 && box.height >= 44, `${box.label} is small: ${box.width}x${box.height}`);
       assert.ok(box.left >= -8 && box.right <= width + 8, `${box.label} is cut off`);
     }
+    const sounds = boxes.filter(({ label }) => ['Sound on', 'Volume'].includes(label)).length;
+    assert.equal(sounds, { desktop: 0, portrait: 1, landscape: 2 }[name]);
     const [play] = boxes.filter(({ label }) => label === 'Play');
     assert.ok(play.left < width / 2 && play.bottom <= height);
     assert.equal(await player(page, () => document.documentElement.scrollWidth <= innerWidth), true);

@@ -65,10 +65,12 @@ export interface SceneSizes {
   frameCount: number;
   /** Rows of a segment of a time plane. */
   segmentRows: number;
+  /** Chunks behind all others. */
+  others?: Part[];
 }
 
 /** Return a scene of symbols that look random. */
-export function scene({ scales, frameCount, segmentRows }: SceneSizes): Uint8Array<ArrayBuffer> {
+export function scene({ scales, frameCount, segmentRows, others: more = [] }: SceneSizes): Uint8Array<ArrayBuffer> {
   const isDynamic = scales[0][4] > 0;
   const names = isDynamic ? ['xy', 'xz', 'yz', 'xt', 'yt', 'zt'] : ['xy', 'xz', 'yz'];
   const head = new Writer();
@@ -108,7 +110,7 @@ export function scene({ scales, frameCount, segmentRows }: SceneSizes): Uint8Arr
   const order = [...spaces, ...firsts].sort((a, b) => byScale(a) - byScale(b));
   laters.sort((a, b) => (a.rowStart ?? 0) - (b.rowStart ?? 0));
   const others = [head, weights, occupancy].map((one, k) => ({ kind: ['SCNE', 'DECO', 'OCCU'][k], body: one.bytes() }));
-  return file([...others, ...order, ...laters], values);
+  return file([...others, ...order, ...laters, ...more], values);
 }
 
 /** Return a clip of groups, each of which shares some frames with the one before it. */

@@ -13,6 +13,7 @@ import type {
   PlaneHead,
   SceneHead,
 } from '../container/scene_chunks.js';
+import { parseSound, SOUND_LIMIT, type SoundSegment } from '../container/sound.js';
 import { loadDriver } from '../render/context.js';
 import type { Core } from './core.js';
 import { decodeSegment, type Projection } from './segment.js';
@@ -65,21 +66,32 @@ export interface SegmentTask {
   asTexels: boolean;
 }
 
+/** Read a soun chunk of a sound of so many samples in all. */
+export interface SoundTask {
+  kind: 'sound';
+  number: number;
+  entry: Entry;
+  body: Uint8Array;
+  total: number;
+}
+
 /** Load the driver of the graphics card. */
 export interface DriverTask {
   kind: 'driver';
 }
 
-export type Task = SceneTask | MetadataTask | ProjectTask | SegmentTask | DriverTask;
+export type Task = SceneTask | MetadataTask | ProjectTask | SegmentTask | SoundTask | DriverTask;
 export type Result<T extends Task> = T extends SceneTask
   ? SceneContent
   : T extends MetadataTask
     ? Metadata
     : T extends ProjectTask
       ? Projection
-      : T extends DriverTask
-        ? undefined
-        : Int8Array<ArrayBuffer> | Uint16Array<ArrayBuffer>;
+      : T extends SoundTask
+        ? SoundSegment
+        : T extends DriverTask
+          ? undefined
+          : Int8Array<ArrayBuffer> | Uint16Array<ArrayBuffer>;
 
 /** Do a task; return its result, and the buffers of it that are moved to the page instead of being copied. */
 export function perform(core: Core, task: Task): { result: Result<Task>; moved: ArrayBuffer[] } {
@@ -89,6 +101,10 @@ export function perform(core: Core, task: Task): { result: Result<Task>; moved: 
     case 'metadata': {
       const chunk = new Chunk(task.number, task.entry, task.body);
       return { result: parseMetadata(chunk.content(META_LIMIT)), moved: [] };
+    }
+    case 'sound': {
+      const content = new Chunk(task.number, task.entry, task.body).content(SOUND_LIMIT);
+      return { result: parseSound(content, task.entry.rowCount, task.total), moved: [] };
     }
     case 'driver':
       loadDriver();

@@ -7,6 +7,7 @@ export interface Commands {
   seek(seconds: number): void;
   changeSpeed(steps: number): void;
   toggleLoop(): void;
+  toggleSound(): void;
   toOpening(): void;
   nextCamera(): void;
   nextPreset(): void;

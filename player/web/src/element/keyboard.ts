@@ -37,6 +37,7 @@ export const KEY_BINDINGS: readonly KeyBinding[] = [
     },
   },
   { keys: 'L', help: 'loop on or off', actions: { l: (do_) => do_.toggleLoop() } },
+  { keys: 'M', help: 'sound off or on', actions: { m: (do_) => do_.toggleSound() } },
   { keys: 'R', help: 'back to the view that the file opens with', actions: { r: (do_) => do_.toOpening() } },
   { keys: 'N', help: 'next camera of the scene', actions: { n: (do_) => do_.nextCamera() } },
   { keys: 'B', help: 'next viewpoint', actions: { b: (do_) => do_.nextPreset() } },

@@ -1,6 +1,7 @@
 /** The custom element `<kpc-player>`; docs/web.md lists its attributes, properties, methods and events. */
 
 import { string, upgrade } from './attributes.js';
+import { AudibleElement } from './audible_element.js';
 import { textOfView } from './camera/view.js';
 import { Clock, type ClockEvent } from './clock.js';
 import type { Model } from './controls/panels.js';
@@ -13,7 +14,6 @@ import { PageScroll } from './page_scroll.js';
 import { PlayPromises } from './play_promises.js';
 import { PlayerCommands } from './player_commands.js';
 import { type PlayerRanges, rangesOf } from './ranges.js';
-import { ReflectedElement } from './reflected_element.js';
 import { Session } from './session.js';
 
 const PROPERTIES = [
@@ -33,7 +33,7 @@ interface Resumed {
 
 const connected = new Set<KpcPlayer>();
 
-export class KpcPlayer extends ReflectedElement implements Model {
+export class KpcPlayer extends AudibleElement implements Model {
   static readonly observedAttributes = [
     ...['src', 'poster', 'controls', 'loop', 'camera', 'camera-controls', 'quality', 'target-fps', 'part'],
     ...['appearance', 'autoplay', 'muted'],
@@ -47,8 +47,6 @@ export class KpcPlayer extends ReflectedElement implements Model {
   #session: Session | null = null;
   #error: PlayerError | null = null;
   #file: Blob | null = null;
-  #volume = 1;
-  #muted: boolean | null = null;
   #keepsLimits = true;
   #hasPlayed = false;
   readonly #plays = new PlayPromises();
@@ -67,6 +65,7 @@ export class KpcPlayer extends ReflectedElement implements Model {
     this.#ui = new Ui(root, this, {
       commands: this.#commands,
       seek: (seconds) => this.#commands.seek(seconds),
+      setVolume: (volume) => Object.assign(this, { muted: false, volume }),
       hold: (isHeld) => {
         this.#clock.isHeld = isHeld;
       },
@@ -84,6 +83,9 @@ export class KpcPlayer extends ReflectedElement implements Model {
       clicked: (event) => this.#ui.click(event),
       commands: this.#commands,
     });
+    for (const gesture of ['click', 'keydown']) {
+      this.#ui.player.addEventListener(gesture, () => this.#session?.sound?.unlock(), { capture: true });
+    }
     this.#fullscreen = new Fullscreen(this, () => this.#refresh());
     this.#ui.setTitle('');
   }
@@ -118,6 +120,7 @@ export class KpcPlayer extends ReflectedElement implements Model {
     if (name === 'loop') this.#clock.loop = this.loop;
     if (name === 'camera' && value !== null) this.camera = value;
     if (name === 'target-fps' && this.#session) this.#session.fps = this.targetFps || undefined;
+    if (name === 'muted' && connected.has(this)) this.loudnessChanged();
     if (name === 'autoplay' && this.autoplay && this.#session?.clip) this.#playByItself();
     this.#refresh();
   }
@@ -174,25 +177,13 @@ export class KpcPlayer extends ReflectedElement implements Model {
     this.#clock.rate = rate;
   }
 
-  get volume(): number {
-    return this.#volume;
+  get hasSound(): boolean {
+    return this.#session?.sound?.isThere ?? false;
   }
 
-  set volume(value: number) {
-    if (!(value >= 0 && value <= 1)) throw new DOMException('volume must be from 0 to 1', 'IndexSizeError');
-    if (value === this.#volume) return;
-    this.#volume = value;
-    this.#emit('volumechange');
-  }
-
-  get muted(): boolean {
-    return this.#muted ?? this.hasAttribute('muted');
-  }
-
-  set muted(value: boolean) {
-    if (value === this.muted) return;
-    this.#muted = value;
-    this.#emit('volumechange');
+  /** Whether sound is on, and the browser permits it. */
+  get isAudible(): boolean {
+    return this.loudness > 0 && !this.#session?.sound?.isBlocked;
   }
 
   get buffered(): PlayerRanges {
@@ -213,6 +204,7 @@ export class KpcPlayer extends ReflectedElement implements Model {
     const promise = this.#plays.add();
     this.#hasPlayed = true;
     this.#clock.play();
+    this.#session?.sound?.unlock();
     if (this.#session === null && this.isConnected) this.#start(true);
     this.#fetch();
     if (this.duration === 0) this.#clock.pause();
@@ -336,11 +328,8 @@ export class KpcPlayer extends ReflectedElement implements Model {
       {
         ...{ src, memory: this.memory, fps: this.targetFps || undefined, clock: this.#clock, stage: this.#ui.stage },
         workerUrl: this.getAttribute('worker-url'),
-        shown: () => ({
-          level: this.quality,
-          part: this.shownPart,
-          appearance: this.appearance,
-        }),
+        volume: () => this.loudness,
+        shown: () => ({ level: this.quality, part: this.shownPart, appearance: this.appearance }),
       },
       this.#input,
       {
@@ -349,6 +338,7 @@ export class KpcPlayer extends ReflectedElement implements Model {
         progress: () => this.#progressed(),
         viewChanged: () => this.#emit('camera-change'),
         lost: (isLost) => this.#ui.notify(isLost ? CONTEXT_LOST : '', isLost),
+        told: (message) => this.#ui.notify(message),
         failed: (error) => this.#failed(error),
         frame: () => this.#refresh(),
       },
@@ -433,6 +423,12 @@ export class KpcPlayer extends ReflectedElement implements Model {
     this.#emit(event);
   }
 
+  protected override loudnessChanged(): void {
+    this.#session?.sound?.unlock();
+    this.#session?.wake();
+    this.#emit('volumechange');
+  }
+
   /** Fetch what the playhead needs from now on, whatever `preload` says. */
   #fetch(): void {
     if (!this.#session) return;
@@ -471,6 +467,9 @@ export class KpcPlayer extends ReflectedElement implements Model {
       ended: clock.ended,
       time: clock.time,
       duration,
+      hasSound: this.hasSound,
+      isAudible: this.isAudible,
+      volume: this.loudness,
       buffered: session?.clip?.buffered ?? [],
       isFullscreen,
       isWhole: this.#scroll.isNone || isFullscreen,

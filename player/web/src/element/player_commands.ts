@@ -44,6 +44,20 @@ export class PlayerCommands implements Commands {
     this.#ui().notify(this.#player.loop ? 'Loop on' : 'Loop off');
   }
 
+  toggleSound(): void {
+    const player = this.#player;
+    if (!player.hasSound) {
+      this.#ui().notify('This scene has no sound');
+    } else if (player.isAudible) {
+      player.muted = true;
+      this.#ui().notify('Sound off');
+    } else {
+      player.muted = false;
+      if (player.volume === 0) player.volume = 1;
+      this.#ui().notify(`Volume ${Math.round(100 * player.volume)} %`);
+    }
+  }
+
   toOpening(): void {
     [this.#camera, this.#preset] = [0, -1];
     this.#player.camera = 'opening';

@@ -11,6 +11,7 @@ import { loadDriver } from './driver.js';
 import { Headset } from './headset/headset.js';
 import type { Input } from './input.js';
 import { Picture, type ShownOptions } from './picture.js';
+import { SessionSound } from './session_sound.js';
 
 /** Pixels of the picture a CSS pixel spans at most, and pixels of the picture at most. */
 const [MOST_RATIO, MOST_PIXELS] = [2, 1 << 22];
@@ -23,6 +24,8 @@ export interface SessionOptions {
   workerUrl: string | null;
   fps: number | undefined;
   clock: Clock;
+  /** Of the sound, 0 to 1; 0 while it is off. */
+  volume(): number;
   /** Where the picture goes. */
   stage: HTMLElement;
   shown(): ShownOptions;
@@ -38,6 +41,8 @@ export interface SessionEvents {
   viewChanged(): void;
   lost(isLost: boolean): void;
   failed(error: unknown): void;
+  /** There is something to tell the user, who can go on. */
+  told(message: string): void;
   /** A frame is over. */
   frame(): void;
 }
@@ -51,6 +56,7 @@ export class Session {
   fetches = true;
   clip: Clip | null = null;
   view: ViewControl | null = null;
+  sound: SessionSound | null = null;
   presets = new Map<string, View['lens']>();
   readonly #options: SessionOptions;
   readonly #events: SessionEvents;
@@ -79,13 +85,14 @@ export class Session {
   }
 
   async open(): Promise<void> {
-    const { src, memory, workerUrl, stage, fps } = this.#options;
+    const { src, memory, workerUrl, stage, fps, clock, volume } = this.#options;
     try {
       const pool = workerUrl === null ? {} : { workerUrl };
       const driver = loadDriver(pool);
       const clip = await Clip.open(src, { memory, signal: this.#opening.signal, pool });
       if (this.#isClosed) return clip.close();
       this.clip = clip;
+      this.sound = new SessionSound(clip, clock, volume, (message) => this.#events.told(message));
       const { aabb } = clip.scenes[0].head;
       const { up, view_limits: limits, opening } = clip.metadata;
       const rig = new Rig(clip.cameras, aabb, up);
@@ -219,9 +226,10 @@ export class Session {
     this.#resizes.disconnect();
     this.#sight.disconnect();
     this.#headset?.leave();
+    this.sound?.close();
     this.clip?.close();
     this.#picture?.dispose();
-    this.clip = this.view = this.#picture = null;
+    this.clip = this.view = this.sound = this.#picture = null;
   }
 
   #frame(now: number): void {
@@ -255,7 +263,8 @@ export class Session {
   #advance(clip: Clip, seconds: number): void {
     const { clock } = this.#options;
     if (this.fetches) clip.setPlayhead({ time: clock.time, rate: clock.speed, loop: clock.loop });
-    clock.tick(seconds, (time) => this.isShown && clip.canShow(time));
+    clock.tick(this.sound?.advance(seconds) ?? seconds, (time) => this.isShown && clip.canShow(time));
+    if (this.isShown) this.sound?.follow(); // a listener may have ended all this
   }
 
   #draw(): void {

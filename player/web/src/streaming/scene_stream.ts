@@ -23,6 +23,7 @@ import {
   segmentsOf,
   segmentsToKeep,
 } from './prefetch.js';
+import { SoundStream } from './sound_stream.js';
 import type { Source } from './source.js';
 import { TimePlane } from './time_plane.js';
 
@@ -80,6 +81,7 @@ export class SceneStream {
   version = 0;
   /** Why nothing more will come; null if it will. */
   error: KpcError | null = null;
+  readonly sound: SoundStream;
   readonly #source: Source;
   readonly #pool: DecoderPool;
   readonly #container: Container;
@@ -110,6 +112,7 @@ export class SceneStream {
     this.group = group;
     [this.#source, this.#pool, this.#container, this.#content] = [source, pool, container, content];
     this.#changed = changed;
+    this.sound = new SoundStream(source, pool, container.index);
     this.#segments = segmentsOf(container.index, content.head);
     this.#state = new Uint8Array(this.#segments.length);
     this.#isMissing = this.#segments.map((segment) => !isThere(container.index[segment.number], source));
@@ -308,19 +311,22 @@ export class SceneStream {
     }, 0);
   }
 
-  /** Bytes that the scene takes beside segments of time planes: textures, grids, texels that wait, and requests. */
+  /** Bytes that the scene takes beside segments of time planes: textures, grids, sound, texels that wait, requests. */
   get fixedBytes(): number {
     const { head, occupancy, motion } = this.#content;
     const largest = Math.max(...this.#segments.map(({ number }) => this.#texelBytes(number)));
     const stored = Math.max(...this.#container.index.map((entry) => (entry.kind === 'PLNE' ? entry.storedLength : 0)));
     const cells = occupancy.occupied.length + occupancy.content.length + occupancy.occupied.length / occupancy.sizes[0];
     const grid = motion ? 4 * motion.displacements.length * (1 + 4 / 3 / motion.sizes[0]) : 0;
-    return textureBytes(head) + cells + grid + WAITING_BYTES + largest + 2 * (RUN_BYTES + stored);
+    return (
+      textureBytes(head) + cells + grid + this.sound.memoryBytes + WAITING_BYTES + largest + 2 * (RUN_BYTES + stored)
+    );
   }
 
   /** End all requests and let go of everything. */
   close(): void {
     this.#isClosed = true;
+    this.sound.close();
     for (const request of this.#requests) request.control.abort();
     for (const scale of this.#timePlanes) for (const plane of Object.values(scale)) plane.clear();
     this.#pieces = [];

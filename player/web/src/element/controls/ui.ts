@@ -5,6 +5,7 @@ import { isHeadsetThere } from '../headset/headset.js';
 import type { PlayerError } from '../messages.js';
 import { IconButton, make, Popup } from './dom.js';
 import { fillSettings, fillViews, keyList, type Model } from './panels.js';
+import { SoundControls } from './sound_controls.js';
 import styles from './styles.css?text';
 import { clockText, Timeline } from './timeline.js';
 
@@ -24,6 +25,11 @@ export interface UiState {
   ended: boolean;
   time: number;
   duration: number;
+  hasSound: boolean;
+  /** Whether sound is on, and the browser permits it. */
+  isAudible: boolean;
+  /** 0 while the sound is off. */
+  volume: number;
   buffered: readonly (readonly [number, number])[];
   /** Whether to offer a large button to begin with. */
   isOffered: boolean;
@@ -35,6 +41,7 @@ export interface UiState {
 export interface UiActions {
   commands: Commands;
   seek(seconds: number): void;
+  setVolume(volume: number): void;
   hold(isHeld: boolean): void;
   reload(): void;
 }
@@ -53,6 +60,7 @@ export class Ui {
   readonly #fill: IconButton;
   readonly #time = make('span', { class: 'time' });
   readonly #timeline: Timeline;
+  readonly #sound: SoundControls;
   readonly #popups: readonly Popup[];
   readonly #keys = make('div', {
     class: 'panel keys',
@@ -76,6 +84,7 @@ export class Ui {
     this.#play = new IconButton('play', 'Play', () => commands.playOrPause());
     this.#fill = new IconButton('fill', 'Fill the screen', () => commands.toggleFullscreen());
     this.#timeline = new Timeline(actions);
+    this.#sound = new SoundControls(() => commands.toggleSound(), actions.setVolume);
     this.#popups = [
       new Popup('view', 'Views', (panel) => this.#opening(panel, () => fillViews(panel, model, commands))),
       new Popup('settings', 'Settings', (panel) => this.#opening(panel, () => fillSettings(panel, model, commands))),
@@ -89,11 +98,12 @@ export class Ui {
       headset.element.hidden = !isThere;
     });
     const buttons = [views.button, settings.button, link, headset, this.#fill].map(({ element }) => element);
+    const space = make('span', { class: 'space' });
     this.#bar = make(
       'div',
       { class: 'bar', part: 'bar' },
       this.#timeline.element,
-      make('div', { class: 'buttons' }, this.#play.element, this.#time, make('span', { class: 'space' }), ...buttons),
+      make('div', { class: 'buttons' }, this.#play.element, ...this.#sound.elements, this.#time, space, ...buttons),
     );
     const cover = make('div', { class: 'cover' }, this.#spinner, this.#large.element, this.#error);
     const panels = [...this.#popups.map(({ panel }) => panel), this.#keys];
@@ -140,6 +150,7 @@ export class Ui {
     const text = `${clockText(state.time, withTenths)} / ${clockText(state.duration, withTenths)}`;
     if (this.#time.textContent !== text) this.#time.textContent = text;
     this.#timeline.update(state);
+    this.#sound.update(state);
     if (this.#isPlaying === paused) {
       this.#isPlaying = !paused;
       this.#stirred();
