@@ -92,9 +92,14 @@ VIEWERS = (
 )
 
 
-@pytest.mark.parametrize("module", (*VIEWERS, "tools.cli.kpedit", "tools.cli.kpjoin", "tools.cli.kpexport"))
-def test_viewers_need_no_numba(module: str) -> None:
-    subprocess.run([sys.executable, "-c", f"{WITHOUT_NUMBA}\nimport kpc.{module}"], check=True)
+def import_all(beginning: str, *modules: str) -> None:
+    """Import modules of kpc in one process, after the beginning of its program."""
+    imports = "\n".join(f"import kpc.{module}" for module in modules)
+    subprocess.run([sys.executable, "-c", f"{beginning}\n{imports}"], check=True)
+
+
+def test_viewers_need_no_numba() -> None:
+    import_all(WITHOUT_NUMBA, *VIEWERS, "tools.cli.kpedit", "tools.cli.kpjoin", "tools.cli.kpexport")
 
 
 def run_without_numba(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -127,27 +132,16 @@ def test_writing_without_numba_is_one_line(tmp_path: Path) -> None:
     assert done.returncode == 1 and done.stderr.count("\n") == 1 and 'pip install ".[cpu]"' in done.stderr
 
 
-@pytest.mark.parametrize("module", VIEWERS)
-def test_viewers_need_no_torch(module: str) -> None:
-    subprocess.run([sys.executable, "-c", f"{WITHOUT_TORCH}\nimport kpc.{module}"], check=True)
+def test_viewers_need_no_torch() -> None:
+    import_all(WITHOUT_TORCH, *VIEWERS)
 
 
-@pytest.mark.parametrize(
-    "module",
-    [
-        "encoder.cli.kpenc",
-        "player.app.kpplay",
-        "tools.cli.kprender",
-        "tools.cli.kpinfo",
-        "tools.cli.kpjoin",
-        "tools.cli.contactsheet",
-    ],
-)
-def test_nobody_needs_what_tests_and_benches_do(module: str) -> None:
+def test_nobody_needs_what_tests_and_benches_do() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     named = {re.split(r"[<>=]", requirement)[0] for extra in ("bench", "test") for requirement in extras[extra]}
     assert "scipy" in named
-    subprocess.run([sys.executable, "-c", f"{without(*sorted(named))}\nimport kpc.{module}"], check=True)
+    tools = (f"tools.cli.{name}" for name in ("kprender", "kpinfo", "kpjoin", "contactsheet"))
+    import_all(without(*sorted(named)), "player.app.kpplay", *tools, "encoder.cli.kpenc")
 
 
 @pytest.mark.parametrize(
