@@ -269,9 +269,7 @@ def test_the_direction_mlp_stays_where_appearances_use_it() -> None:
 
 
 @pytest.mark.parametrize("quality", [10, 20, 99])
-def test_a_pruned_file_is_coded_with_its_own_steps_or_coarser_ones(
-    quality: float,
-) -> None:
+def test_a_pruned_file_is_coded_with_its_own_steps_or_coarser_ones(rounded: None, quality: float) -> None:
     scene = redundant(tiny_scene(scales=3, resolution=(48, 40, 32)))
     own = quantise_scene(scene, [dict.fromkeys(planes, 0.004) for planes in scene.scales])
     coded = code(model_from_file(own), Trade(quality=quality), 0.25, 0)
