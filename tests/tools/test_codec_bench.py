@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import pickle
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -104,7 +105,7 @@ def few(monkeypatch: pytest.MonkeyPatch, quick_coding: None) -> None:
     monkeypatch.setattr("kpc.encoder.rdo.codec_model.TOLERANCE", 0.2)
     monkeypatch.setattr(codec_bench, "TUNE_STEPS", 0)
     monkeypatch.setattr(codec_bench, "RATES", (1e-3, 3.0, 4.0))
-    monkeypatch.setattr(codec_bench, "QUALITIES", (60, 75, 90))
+    monkeypatch.setattr(codec_bench, "QUALITIES", (60, 90))
     others = Float16("zstd -19"), Uint8(), Video("X", "libnothing", (1,), ())
     monkeypatch.setattr(codec_bench, "BASELINES", {baseline.name: baseline for baseline in others})
     monkeypatch.setattr(
@@ -130,7 +131,7 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
         assert one["missing"] == "this ffmpeg has no libnothing" and one["points"] == [] and one["bd_rate"] is None
     assert len(halves["points"]) == 6 and halves["bd_rate"] is not None
     whole = scene_file.stat().st_size
-    assert len(ours["points"]) == 5  # no file is as small as a thousandth of a bit per parameter
+    assert len(ours["points"]) == 4  # no file is as small as a thousandth of a bit per parameter
     for found in ours["points"]:
         assert found["size_bytes"] <= whole and sum(found["shares"].values()) == pytest.approx(1)
         assert found["bits_per_parameter"] == pytest.approx(
@@ -138,11 +139,11 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
         )
     rates = [p["size_bytes"] for p in ours["points"][:2]]
     assert rates[0] <= 3 * tiny_scene(3, channels=4).parameter_count / 8 and rates[0] < rates[1]
-    for found, quality in zip(ours["points"][2:], (60, 75, 90), strict=True):
+    for found, quality in zip(ours["points"][2:], (60, 90), strict=True):
         assert found["setting"] == f"quality {quality}"
         # The file itself is hardly finer, and errors jump where so small a plane switches its coding mode.
         assert 0 <= found["agreement_db"] - (20 + quality / 3) < 1.5
-    assert "| scene | 60 | 75 | 90 |" in tables.markdown(records)
+    assert "| scene | 60 | 90 |" in tables.markdown(records)
     others = codec_bench.others_bytes(scene_file)
     assert min(p["size_bytes"] for p in halves["points"]) > others > 100
     assert all(found["size_bytes"] - found["planes_bytes"] == others for found in halves["points"])
@@ -154,7 +155,7 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert "KB at 0.15 dB loss" in output.err and "Coding, beside general-purpose codecs" in tables.markdown(records)
     with (tmp_path / "codec.csv").open() as table:
         rows = list(csv.DictReader(table))
-    assert len(rows) == 5 + 7 * 3 + 6 + 5 and [len(one["points"]) for one in without] == [3] * 7
+    assert len(rows) == 4 + 7 * 2 + 6 + 5 and [len(one["points"]) for one in without] == [2] * 7
     assert {row["coder"] for row in rows} == {"kpc", *codec_bench.ABLATIONS, "fp16 + zstd -19", "uint8 + zstd -19"}
     assert float(rows[0]["size_bytes"]) == ours["points"][0]["size_bytes"]
     svg = (tmp_path / "codec.svg").read_text()
@@ -238,13 +239,13 @@ def test_distortion_on_held_out_views(
 
 
 def test_separate_processes(scene_file: Path) -> None:
-    jobs = [
-        codec_bench.Job(scene_file, "kpc, no fine-tuning", "quality 5", codec_bench.Trade(quality=5.0)),
-        codec_bench.Job(scene_file, Uint8().name, 4),
-    ]
-    ours, levels = codec_bench.in_parallel(jobs, None, 2)
-    assert ours is not None and levels is not None and ours["psnr"] < 30 and levels["size_bytes"] > 100
-    assert math.isfinite(levels["psnr"])
+    """By baselines, since quick settings do not reach other processes, where KPC's coder would take long."""
+    jobs = [codec_bench.Job(scene_file, Float16("zstd -19").name, 10), codec_bench.Job(scene_file, Uint8().name, 4)]
+    halves, levels = codec_bench.in_parallel(jobs, None, 2)
+    assert halves is not None and levels is not None and halves["size_bytes"] > levels["size_bytes"] > 100
+    assert levels["psnr"] < halves["psnr"] < math.inf
+    ours = codec_bench.Job(scene_file, "kpc", "quality 5", codec_bench.Trade(quality=5.0))
+    assert pickle.loads(pickle.dumps(ours)) == ours
 
 
 def test_errors_are_one_line(few: None, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -265,9 +266,10 @@ def test_errors_are_one_line(few: None, scene_file: Path, tmp_path: Path, capsys
 def test_records_are_json(
     few: None, scene_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(codec_bench, "RATES", (3.0,))
+    monkeypatch.setattr(codec_bench, "RATES", ())
     monkeypatch.setattr(codec_bench, "QUALITIES", (60,))
     monkeypatch.setattr(codec_bench, "TUNE_STEPS", 2)
+    monkeypatch.setattr(Uint8, "settings", (8, 4))
     monkeypatch.setattr(codec_bench, "BASELINES", {Uint8().name: Uint8()})
     monkeypatch.setattr(codec_bench, "FINE_TUNED", {"levels, fine-tuned": Uint8().name})
     assert kpbench.main(["codec", str(scene_file)]) == 0
