@@ -235,9 +235,10 @@ def fit_intrinsics(
     fl_x, fl_y, cx, cy = intrinsics
     sx, sy = actual[0] / declared[0], actual[1] / declared[1]
     if not fits(declared, actual):
+        remedy = "turn it back" if fits(declared, actual[::-1]) else "undo the crop or correct the size there"
         raise DatasetError(
             f"{file}: is {actual[0]}x{actual[1]}, but {where} is for {declared[0]:g}x{declared[1]:g}, another aspect "
-            "ratio; undo the crop or correct the size there"
+            f"ratio; {remedy}"
         )
     return fl_x * sx, fl_y * sy, cx * sx, cy * sy
 

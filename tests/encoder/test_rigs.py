@@ -248,7 +248,20 @@ def test_which_file_is_whose_is_never_guessed(tmp_path: Path) -> None:
     fails(tmp_path / "set", "camera cam0 may have filmed walk-cam0.png and walk-cam00.png")
     for file in list((tmp_path / "set").glob("*cam*.png")):
         file.unlink()
+    (tmp_path / "set/videos").mkdir()
+    (tmp_path / "set/videos/walk.mp4").write_bytes(b"")
     fails(tmp_path / "set", "none of its 3 cameras (cam0, cam1, cam2) has a video or images in videos/")
+
+
+def test_folders_of_no_camera_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is not read is no reason to refuse what is, however its files are called."""
+    rigs.write_opencv_json(tmp_path / "set")
+    rigs.write_images(tmp_path / "set/extra", ["cam0", "cam00", "cam2"])
+    rigs.write_images(tmp_path / "set/images", ["cam0", "cam00", "cam2"])
+    rigs.write_videos(tmp_path / "set/videos", ["one", "two", "three"])
+    assert load(tmp_path / "set").pictures.file == ("cam0.png", "cam1.png", "cam2.png")
+    line = capsys.readouterr().err
+    assert "images in the folder itself are read; left out: videos in videos, " in line and ", extra" in line
 
 
 def test_instants_go_by_numbers_else_by_order(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

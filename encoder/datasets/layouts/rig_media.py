@@ -122,29 +122,45 @@ def _media(
     """
     prefers_images = bool(foregrounds)
     found: list[tuple[str, bool, dict[str, Media], list[Media]]] = []
+    others, problem = [], None
     for folder in dict.fromkeys(folders):
-        if (root / folder).is_dir():
-            entries = _entries(root / folder, {*folders, *foregrounds} if folder == "." else set())
-            for is_film in (False, True) if prefers_images else (True, False):
-                some = [entry for entry in entries if bool(entry.images) != is_film]
-                if matched := _matched(file, names, some):
-                    found.append((folder, is_film, matched, some))
+        if not (root / folder).is_dir():
+            continue
+        entries = _entries(root / folder, {*folders, *foregrounds} if folder == "." else set())
+        for is_film in (False, True) if prefers_images else (True, False):
+            some = [entry for entry in entries if bool(entry.images) != is_film]
+            try:
+                matched = _matched(file, names, some)
+            except DatasetError as error:
+                matched, problem = {}, problem or error
+            if matched:
+                found.append((folder, is_film, matched, some))
+            elif some and folder != ".":
+                others.append(_described(is_film, folder))
     if not found:
         searched = " or ".join("the folder itself" if folder == "." else f"{folder}/" for folder in folders)
-        raise DatasetError(
+        raise problem or DatasetError(
             f"{file}: none of its {len(names)} cameras ({first_names(names)}) has a video or images in {searched}; "
             "name videos, or folders of images, after the cameras"
         )
     found.sort(key=lambda kind: (-len(kind[2]), kind[1] == prefers_images))  # stable: of equals the first
     folder, is_film, chosen, entries = found[0]
-    if len(found) > 1:
-        others = [f"{'videos' if film else 'images'} in {name}" for name, film, _, _ in found[1:]]
-        kind = "videos" if is_film else "images"
-        print(f"{root}: {kind} in {folder} are read; left out: {first_names(others)}", file=sys.stderr)
-    if folder == ".":
+    others += [_described(film, name) for name, film, _, _ in found[1:]]
+    if folder == ".":  # which may hold anything
+        kept = {entry.path for entry in chosen.values()}
+        strange = [
+            entry.path.parent if entry.path.is_file() else entry.path for entry in entries if entry.path not in kept
+        ]
+        others += [path.name for path in dict.fromkeys(strange) if path != root]
         entries = list(chosen.values())
+    if others:
+        print(f"{root}: {_described(is_film, folder)} are read; left out: {first_names(others)}", file=sys.stderr)
     files = [image for entry in entries for image in (entry.images or (entry.path,))]
     return chosen, [*files, *(item for item in media_in(root / folder) if is_video(item) == is_film)]
+
+
+def _described(is_film: bool, folder: str) -> str:
+    return f"{'videos' if is_film else 'images'} in {'the folder itself' if folder == '.' else folder}"
 
 
 def _entries(folder: Path, others: set[str]) -> list[Media]:
