@@ -12,10 +12,10 @@ from kpc.encoder.cli.estimate import Estimate, estimate
 from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group
 from kpc.encoder.cli.options import ALL_VIEWS, Options, parse
 from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer
+from kpc.encoder.cli.read_dataset import read_dataset
 from kpc.encoder.cli.report import print_estimate, print_result
 from kpc.encoder.cli.transcode import transcode
 from kpc.encoder.cli.work_folder import leaving_nothing, make_work_folder
-from kpc.encoder.datasets import load_dataset
 from kpc.encoder.evaluation.ablations import effective_ablations
 from kpc.encoder.evaluation.profile import profile
 from kpc.encoder.evaluation.validation_rays import VALIDATION_RAYS
@@ -103,7 +103,7 @@ def profile_steps(options: Options) -> dict[str, Any]:
 def ablations(options: Options) -> list[str]:
     """Return the names of the ablations that change a run (`kpc.encoder.evaluation.ablations`). Raises as `encode`."""
     make_work_folder(options.work_dir)
-    dataset = load_dataset(options.source, options.work_dir, holdout=options.holdout, downscale=options.downscale)
+    dataset = read_dataset(options)
     return effective_ablations(options.config(dataset))
 
 

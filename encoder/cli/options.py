@@ -13,6 +13,7 @@ from kpc.encoder.evaluation.ablations import ABLATIONS, BASELINE
 from kpc.encoder.evaluation.testing_time import FEWEST_PICTURES
 from kpc.encoder.field.appearances import choose_appearance
 from kpc.encoder.field.config import APPEARANCES, PRESETS, PROGRESSIVE_SCALE_DROPOUT, TrainConfig
+from kpc.encoder.poses.wishes import Wishes, add_pose_options, wishes_from
 from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, Trade
 from kpc.format.common import cli
 from kpc.format.container.metadata_options import TEXTS, add_metadata_options, members_from
@@ -48,6 +49,7 @@ class Options:
             "auto", or where nothing is trained for those of the source.
         audio: "auto", "none", a camera or a file.
         audio_bitrate: of its sound, bits per second; None for a default.
+        wishes: about footage without poses.
         ablation: one of `kpc.encoder.evaluation.ablations`; not an option of the command line.
     """
 
@@ -80,6 +82,7 @@ class Options:
     view_limits: str | Mapping[str, Any] | None = None
     audio: str = "auto"
     audio_bitrate: int | None = None
+    wishes: Wishes = field(default_factory=Wishes)
     ablation: str = BASELINE
 
     @property
@@ -135,6 +138,7 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     _add_training_options(parser)
     _add_dataset_options(parser)
     _add_sound_options(parser)
+    add_pose_options(parser)
     _add_run_options(parser)
     _add_coding_options(parser)
     add_metadata_options(parser)
@@ -364,6 +368,7 @@ def _options_from(given: argparse.Namespace) -> Options:
         view_limits=given.view_limits,
         audio=given.audio,
         audio_bitrate=given.audio_bitrate,
+        wishes=wishes_from(given),
     )
 
 

@@ -6,11 +6,12 @@ import numpy as np
 
 from kpc.encoder.cli.grouped import initialise_from
 from kpc.encoder.cli.options import Options
+from kpc.encoder.cli.read_dataset import read_dataset
 from kpc.encoder.cli.report import SPACES, describe_model, describe_time_rows, log, show_progress
 from kpc.encoder.cli.sound import find_sound
 from kpc.encoder.cli.transcode import check_outputs
 from kpc.encoder.cli.work_folder import CHECKPOINT, choose_device, make_work_folder, remove_if_empty
-from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.datasets import Dataset
 from kpc.encoder.datasets.plausibility import doubts
 from kpc.encoder.field.bounds import (
     find_box,
@@ -69,7 +70,7 @@ def prepare_setting(options: Options) -> Setting:
     choose_device(options.device)
     make_work_folder(options.work_dir)
     try:
-        dataset = load_dataset(options.source, options.work_dir, holdout=options.holdout, downscale=options.downscale)
+        dataset = read_dataset(options)
         aabb, mapping, why = _find_space(dataset, options)
         sound, sound_from = find_sound(options, dataset)
     except BaseException:

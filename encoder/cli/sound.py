@@ -68,7 +68,10 @@ def _videos(dataset: Dataset) -> dict[str, Path]:
 
 
 def _samples(dataset: Dataset, path: Path, most_s: float = float("inf")) -> np.ndarray | None:
-    return read_samples(path, dataset.video_start_s or 0.0, min(dataset.clip.total_s, most_s))
+    name = path.relative_to(dataset.path).as_posix() if path.is_relative_to(dataset.path) else ""
+    offset_s, rate = dataset.clocks.get(name, (0.0, 1.0))
+    start_s = ((dataset.video_start_s or 0.0) - offset_s) / rate
+    return read_samples(path, start_s, min(dataset.clip.total_s, most_s))
 
 
 def _clearest(dataset: Dataset, files: dict[str, Path]) -> tuple[Path | None, str]:

@@ -1,6 +1,7 @@
 """The work folder of an encode, where decoded pixels and the checkpoint are kept, and the device to train on."""
 
 import contextlib
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.container import rewriting
 
 CHECKPOINT = "checkpoint.kpck"
+POSES = "poses"  # the folder of cameras found for footage without poses
 
 
 def make_work_folder(work: Path) -> None:
@@ -30,6 +32,7 @@ def clear_work_folder(work: Path) -> None:
     for pattern in ("pixels-*.bin", "pixels-*.json", *of_groups, CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"):
         for leftover in work.glob(pattern):
             leftover.unlink(missing_ok=True)
+    shutil.rmtree(work / POSES, ignore_errors=True)
     remove_if_empty(work)
 
 
@@ -41,7 +44,7 @@ def leaving_nothing(work: Path) -> Iterator[None]:
         yield
     finally:
         for leftover in set(work.glob("*")) - before:
-            leftover.unlink(missing_ok=True)
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink(missing_ok=True)
         remove_if_empty(work)
 
 

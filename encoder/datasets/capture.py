@@ -15,7 +15,7 @@ import numpy as np
 from kpc.encoder.datasets.video import VideoInfo, video_info
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
-from kpc.format.common.media_files import IMAGE_SUFFIXES
+from kpc.format.common.media_files import IMAGE_SUFFIXES, is_video
 from kpc.format.scene.camera_checks import NO_DISTORTION, Distortion, check_depths, check_lens, check_pose
 
 # Where neither the dataset nor the user names test images, every eighth is one, as in LLFF (arXiv:1905.00889).
@@ -75,6 +75,7 @@ class CapturedView:
         is_fisheye: whether `distortion` is that of OpenCV's fisheye model.
         foreground: a mask that is the image's alpha: what is 0 there is transparent.
         camera: the camera's name, where it is not that of the file.
+        clock: of a video, seconds to be added to its times after they are multiplied by the second number.
     """
 
     file: Path
@@ -95,6 +96,7 @@ class CapturedView:
     is_fisheye: bool = False
     foreground: Path | None = None
     camera: str | None = None
+    clock: tuple[float, float] = (0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -285,7 +287,7 @@ def holdout_flags(path: Path, names: Sequence[str], holdout: str | None, default
 
 
 def find_image(root: Path, file: Path, name: str) -> Path | None:
-    """Find an image by a name relative to `root`, with or without its suffix.
+    """Find an image or video by a name relative to `root`; an image also without its suffix.
 
     Args:
         root: the folder of images.
@@ -315,7 +317,7 @@ def find_image(root: Path, file: Path, name: str) -> Path | None:
     ):
         bare, suffix = root / form, Path(form).suffix
         is_image = suffix.lower() in IMAGE_SUFFIXES
-        if is_image and file_exists(bare):
+        if (is_image or is_video(bare)) and file_exists(bare):
             return bare
         found = (_in_any_case(bare.with_suffix(""), suffix) if is_image else None) or with_image_suffix(bare)
         if found is not None:

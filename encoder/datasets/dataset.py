@@ -1,6 +1,7 @@
 """A dataset as training sees it: pictures as a struct of arrays, with random access to pixels."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,7 @@ class Dataset:
         masks: which pixels may be used; None if all may.
         left_out: how many images or videos in the folders that were read are not used.
         video_start_s: when the whole clip begins, in the seconds of the videos; None if the pictures are images.
+        clocks: of videos by their names: the offset and rate that make their times those of the clip.
     """
 
     layout: str
@@ -91,6 +93,7 @@ class Dataset:
     masks: Masks | None = None
     left_out: int = 0
     video_start_s: float | None = None
+    clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def is_monocular(self) -> bool:

@@ -60,6 +60,7 @@ def load_dataset(
     holdout: str | None = None,
     downscale: int = 1,
     progress: bool = True,
+    transforms: Path | None = None,
 ) -> Dataset:
     """Read a dataset: recognise its layout by its content, decode its pictures and masks, and read its cameras.
 
@@ -72,6 +73,7 @@ def load_dataset(
         downscale: every block of downscale^2 pixels is averaged to one; the remainder on the right and below is
             cropped. A block is usable if all its pixels are.
         progress: whether to report progress on stderr.
+        transforms: a document of `kpposes` for the folder, if it lies elsewhere.
 
     Raises:
         DatasetError: the folder does not exist, has no known layout, is inconsistent, its masks leave nothing to train
@@ -80,7 +82,7 @@ def load_dataset(
     """
     root = Path(path)
     try:
-        capture = _recognise(root, holdout)
+        capture = _recognise(root, holdout) if transforms is None else nerfstudio.read(root, holdout, transforms)
         _check(root, capture, downscale)
         report_orientations(root, capture.views)
         masks = find_masks(root, capture.views)
@@ -117,6 +119,11 @@ def _recognise(root: Path, holdout: str | None) -> Capture:
         "(EasyMocap), calibration_*.json (Panoptic Studio), camera_array.toml (Caliscope), calibration.toml (Anipose), "
         "*.qca.txt (Qualisys), sparse/0 with cameras and images (COLMAP), K R t in YAML or JSON (OpenCV)"
     )
+
+
+def has_layout(root: Path) -> bool:
+    """Return whether a folder is read by a layout."""
+    return root.is_dir() and any(layout.recognise(root) for layout in LAYOUTS)
 
 
 def _check(root: Path, capture: Capture, downscale: int) -> None:
@@ -189,6 +196,7 @@ def _load(
         names,
         masks,
         video_start_s=video_start_s,
+        clocks={view.file.relative_to(root).as_posix(): view.clock for view in views if view.video},
     )
 
 
@@ -199,7 +207,7 @@ def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray,
     Videos are aligned by `timeline.align`. The time of an image is the dataset's if all are within [0, 1], else shifted
     and scaled to [0, 1]; the frame count of their clip follows from the median step between times of training images.
     """
-    videos = {_name(root, capture, view): view.video for view in capture.views if view.video}
+    videos = {_name(root, capture, view): _in_step(view) for view in capture.views if view.video}
     if videos:
         _report_notes(root, videos)
         timeline = align(root, videos)
@@ -222,6 +230,15 @@ def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray,
     steps = np.diff(np.unique(np.round(times[[not view.is_test for view in capture.views]], 6)))
     count = min(1 + round(1 / float(np.median(steps))), len(times)) if len(steps) else 1
     return still, times, Clip(count, float(capture.fps or ASSUMED_FPS)), None
+
+
+def _in_step(view: CapturedView) -> VideoInfo:
+    """Return the properties of a view's video with its times by the common clock."""
+    assert view.video is not None
+    offset_s, rate = view.clock
+    return replace(
+        view.video, times=offset_s + rate * view.video.times, tick_s=rate * view.video.tick_s, fps=view.video.fps / rate
+    )
 
 
 def _name(root: Path, capture: Capture, view: CapturedView) -> str:

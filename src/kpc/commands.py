@@ -17,6 +17,7 @@ def _run(name: str, module: str, argv: list[str] | None = None) -> int:
 
 
 kpenc = partial(_run, "kpenc", "kpc.encoder")
+kpposes = partial(_run, "kpposes", "kpc.encoder.cli.kpposes")
 kpplay = partial(_run, "kpplay", "kpc.player.app.kpplay")
 kprender = partial(_run, "kprender", "kpc.tools.cli.kprender")
 kpinfo = partial(_run, "kpinfo", "kpc.tools.cli.kpinfo")

@@ -5,7 +5,7 @@ Source: https://docs.nerf.studio/quickstart/data_conventions.html
 
 from pathlib import Path
 
-from kpc.encoder.datasets.capture import Capture, holdout_flags, natural_key
+from kpc.encoder.datasets.capture import Capture, first_names, holdout_flags, natural_key
 from kpc.encoder.datasets.layouts.splits import split_of
 from kpc.encoder.datasets.layouts.transforms import (
     find_images,
@@ -15,6 +15,8 @@ from kpc.encoder.datasets.layouts.transforms import (
     report_contradictions,
 )
 from kpc.encoder.datasets.left_out import media_in
+from kpc.format.common.errors import DatasetError
+from kpc.format.common.media_files import is_video
 
 # The layout's name in messages.
 NAME = "nerfstudio"
@@ -25,21 +27,35 @@ def recognise(path: Path) -> bool:
     return (path / "transforms.json").is_file()
 
 
-def read(path: Path, holdout: str | None) -> Capture:
+def read(path: Path, holdout: str | None, transforms: Path | None = None) -> Capture:
     """Read the folder. Test pictures are what the document lists, else every eighth existing image (`split_of`).
 
-    With `holdout`, the document's lists are ignored, and all other pictures are trained on.
+    With `holdout`, the document's lists are ignored, and all other pictures are trained on. A document of `kpposes`
+    names the videos of cameras that stand still; all are trained on.
+
+    Args:
+        path: the folder.
+        holdout: as for `holdout_flags`.
+        transforms: the document, if it lies elsewhere.
 
     Raises:
-        DatasetError, MediaError: the JSON or an image cannot be used.
+        DatasetError, MediaError: the JSON, an image or a video cannot be used.
     """
-    file = path / "transforms.json"
+    file = transforms or path / "transforms.json"
     document = load_transforms(file)
     found = find_images(path, file, document)
     missing = [frame["file_path"] for number, frame in enumerate(document["frames"]) if number not in found]
     existing = sorted(found.items(), key=lambda item: natural_key(item[1].relative_to(path).as_posix()))
-    report_contradictions(file, document, existing[0][1])
     images = [image for _, image in existing]
+    films = [image for image in images if is_video(image)]
+    if films and len(films) < len(images):
+        raise DatasetError(
+            f"{file}: lists videos ({first_names([film.name for film in films])}) beside images; give one"
+        )
+    if films:
+        holdout = holdout or "none"
+    else:
+        report_contradictions(file, document, images[0])
     split = split_of(path, file, document, images, missing) if holdout is None else ["train"] * len(images)
     default = [part == "test" for part in split]
     tests = holdout_flags(path, [str(image.relative_to(path)) for image in images], holdout, default)

@@ -19,12 +19,14 @@ from kpc.encoder.datasets.capture import (
     image_view,
     printable,
     report_missing,
+    video_view,
 )
 from kpc.encoder.datasets.layouts.documents import read_json
 from kpc.encoder.datasets.layouts.transforms_keys import check_keys
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
-from kpc.format.scene.camera_checks import DISTORTION_KEYS, Distortion, number_of, pose_of
+from kpc.format.common.media_files import is_video
+from kpc.format.scene.camera_checks import DISTORTION_KEYS, Distortion, check_depths, number_of, pose_of
 from kpc.format.scene.camera_models import FISHEYE_MODELS, understood_model
 
 # Focal lengths that differ by less than this share are the same.
@@ -32,6 +34,9 @@ SAME_FOCAL = 0.02
 
 # Frame rates that are believed, frames per second: from a picture in a quarter of an hour to a high-speed camera.
 LEAST_FPS, GREATEST_FPS = 1e-3, 1e3
+
+# Clocks that are believed: the largest offset in seconds, and how much faster one may run.
+LONGEST_OFFSET_S, GREATEST_RATE = 1e5, 2.0
 
 # Keys that say the same in other words: a frame that has one of them overrides all of the document.
 _SAME = (("fl_x", "camera_angle_x", "x_fov"), ("fl_y", "camera_angle_y", "y_fov"))
@@ -92,6 +97,8 @@ def frame_view(
     """
     where = f"{file} frame {number}"
     keys = _merged(document, document["frames"][number])
+    if is_video(image):
+        return _video_view(where, keys, image, is_test)
     if ("w" in keys) != ("h" in keys):
         raise DatasetError(f"{where}: has only one of w and h; add the other or export anew")
     _check_rays(where, keys, image)
@@ -114,6 +121,22 @@ def frame_view(
         far=number_of(where, keys, "far", math.nan),
     )
     return replace(view, mask=_mask(root, file, where, keys, image))
+
+
+def _video_view(where: str, keys: dict[str, Any], video: Path, is_test: bool) -> CapturedView:
+    """Return the view of a video of a camera that stands still, with the clock that `kpposes` gives it."""
+    if not ("w" in keys and "h" in keys):
+        raise DatasetError(f"{where}: the frame of a video needs w and h; add them, or run kpposes")
+    width, height = number_of(where, keys, "w"), number_of(where, keys, "h")
+    centre = number_of(where, keys, "cx", width / 2), number_of(where, keys, "cy", height / 2)
+    lens = Lens((width, height), (*_focals(where, keys, width, height), *centre), *_distortion(where, keys))
+    view = video_view(video, where, lens, pose_of(where, keys), is_test)
+    near, far = number_of(where, keys, "near", math.nan), number_of(where, keys, "far", math.nan)
+    check_depths(where, near, far)
+    offset, rate = number_of(where, keys, "time_offset", 0.0), number_of(where, keys, "time_rate", 1.0)
+    if not (abs(offset) <= LONGEST_OFFSET_S and 1 / GREATEST_RATE <= rate <= GREATEST_RATE):
+        raise DatasetError(f"{where}: time_offset {offset:g} or time_rate {rate:g} is that of no clock; correct it")
+    return replace(view, near=near, far=far, clock=(offset, rate))
 
 
 def report_contradictions(file: Path, document: dict[str, Any], image: Path) -> None:

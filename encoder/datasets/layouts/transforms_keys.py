@@ -19,7 +19,7 @@ from kpc.format.scene.camera_models import NO_PINHOLE_KEYS, check_unknown_keys
 READ = frozenset(
     "frames file_path transform_matrix time fps near far w h fl_x fl_y camera_angle_x camera_angle_y x_fov y_fov cx cy "
     "k1 k2 p1 p2 k3 k4 k5 k6 distortion_params camera_model camera_type is_fisheye mask_path enable_ray_loading "
-    "train_filenames val_filenames test_filenames".split()
+    "train_filenames val_filenames test_filenames time_offset time_rate".split()
 )
 
 # Keys without effect, although other programs use them, by the reason that is given to the user.
@@ -40,7 +40,7 @@ WITHOUT_EFFECT = {
 }
 
 # Keys that only inform; nothing is said about them.
-INFORMATION = frozenset(("colmap_im_id", "rotation", "sharpness"))
+INFORMATION = frozenset(("colmap_im_id", "rotation", "sharpness", "made_by", "kind", "unit"))
 
 # Keys by which the camera is no pinhole or the pose means something else, by remedy. They are refused unless their
 # value is 0, false, null or empty.

@@ -1,0 +1,76 @@
+"""kpposes: find the cameras of a folder of videos, and bring the videos in step.
+
+    kpposes videos/ -o transforms.json                   cameras and clocks, in the layout of nerfstudio
+    kpposes videos/ --distance cam00,cam05=1.2           in metres: these two cameras are 1.2 m apart
+    kpposes videos/ --sync motion --require-all          by what moves, and no camera may be missing
+
+`kpenc videos/` does this by itself where a folder has no poses.
+"""
+
+import argparse
+import math
+import sys
+from pathlib import Path
+
+from kpc.encoder.poses.document import write_document
+from kpc.encoder.poses.find import Found, find_poses
+from kpc.encoder.poses.wishes import add_pose_options, wishes_from
+from kpc.format.common import cli
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    return cli.run(_command, "kpposes", argv)
+
+
+def _command(argv: list[str]) -> None:
+    options = _parser().parse_args(argv)
+    file = options.output or options.folder / "transforms.json"
+    found = find_poses(options.folder, wishes_from(options))
+    write_document(found, options.folder, file)
+    print(report(found))
+    print(f"{file}: {len(found.structure.views)} of {len(found.view_names)} placed")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="kpposes", description="Find the cameras of a folder of videos, and bring the videos in step."
+    )
+    cli.add_version_option(parser)
+    parser.add_argument(
+        "folder", type=Path, metavar="videos", help="a folder of videos, of folders of frames, or of photographs"
+    )
+    parser.add_argument("-o", "--output", type=Path, metavar="JSON", help="default: transforms.json in the folder")
+    add_pose_options(parser)
+    return parser
+
+
+def report(found: Found) -> str:
+    """Return a table of the cameras: clock, points and error, as text."""
+    if found.kind != "still rig":
+        views = found.structure.views.values()
+        points = sorted(view.points for view in views)
+        return f"{len(views)} pictures, error {found.structure.error:.2f} px, {points[len(points) // 2]} points in each"
+    rows = [("camera", "clock s", "rate", "by", "confidence", "focal px", "points", "error px")]
+    for number, (name, clock) in enumerate(zip(found.view_names, found.clocks, strict=True)):
+        view = found.structure.views.get(number)
+        rows.append(
+            (
+                name,
+                f"{clock.offset_s:+.4f}",
+                f"{clock.rate:.5f}",
+                clock.method,
+                "" if math.isnan(clock.confidence) else f"{clock.confidence:.0%}",
+                "not placed" if view is None else f"{view.intrinsics[0]:.1f}",
+                "" if view is None else f"{view.points}",
+                "" if view is None else f"{view.error:.2f}",
+            )
+        )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,310 @@
+"""Structure from motion by COLMAP, in a process of its own: `python -m kpc.encoder.poses.colmap_worker FOLDER`.
+
+COLMAP's wheel brings its own zlib, which crashes beside those of other wheels, and cannot be interrupted. The folder
+holds `job.json` and pictures as .npy files, which `kpc.encoder.poses.structure` writes; it also reads the result. Lines
+of JSON on stdout report progress.
+
+A *view* is a camera at a place: a camera of a still rig, or one picture of a moving camera. It may have pictures of
+several instants. Features are matched between pictures of the same instant only, so that what moves can be matched,
+too; all matches of two views then count together.
+"""
+
+import json
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+# A camera model with more parameters is taken if it lowers n log(sum of squared errors) by so many times log(n) for
+# each: the Bayesian information criterion has 1, but errors of one point in many views are not independent.
+EVIDENCE = 4.0
+# Camera models in the order in which they are tried, by their parameters beside the principal point.
+MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+
+# The camera model while views are placed.
+FIRST_MODEL = "SIMPLE_RADIAL"
+
+# Views that a model has at least.
+LEAST_VIEWS = 3
+# Mean distance in pixels between points and where they were found, below which a model of all views is believed.
+GOOD_ERROR = 1.0
+
+# Focal length by the larger side of the picture before anything is known, as COLMAP assumes it.
+FOCAL = 1.2
+
+# The largest angle between descriptors that match, in radians, and its largest ratio to the angle of the next.
+FURTHEST, RATIO = 0.7, 0.8
+
+
+def main(folder: Path) -> None:
+    """Carry out the job of a folder; write `result.json` and `result.npz` there."""
+    job = json.loads((folder / "job.json").read_text())
+    pycolmap.logging.minloglevel = 2
+    pycolmap.set_random_seed(job["seed"])
+    pictures = list(_features(folder, job))
+    matches = _matches(job, [features for _, features in pictures])
+    database = folder / "views.db"
+    _write_views(database, job, [keypoints for keypoints, _ in pictures], matches)
+    pycolmap.geometric_verification(database)
+    model = _reconstruct(folder, database, job)
+    found: dict[str, Any] = {"pairs": _pairs(database), "views": {}}
+    arrays: dict[str, Any] = {}
+    if model is not None:
+        model = _with_best_cameras(model)
+        found["views"], arrays = _views(model), _points(model)
+    np.savez(folder / "result.npz", **arrays)
+    (folder / "result.json").write_text(json.dumps(found))
+
+
+def _say(step: str, done: int, total: int) -> None:
+    print(json.dumps({"step": step, "done": done, "total": total}), flush=True)
+
+
+def _features(folder: Path, job: dict[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield for each picture the (N, 4) float32 keypoints x y scale orientation, and (N, 128) float32 descriptors of
+    length 1.
+    """
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.max_num_features = job["features"]
+    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    for number, picture in enumerate(job["pictures"]):
+        keypoints, descriptors = extractor.extract_from_uint8_array(np.load(folder / picture["file"]))
+        places = pycolmap.keypoints_to_matrix(keypoints)
+        used = np.ones(len(places), bool)
+        if picture["mask"] is not None:  # (H, W) bool
+            mask = np.load(folder / picture["mask"])
+            x, y = (places[:, axis].astype(int).clip(0, mask.shape[1 - axis] - 1) for axis in (0, 1))
+            used = mask[y, x]
+        places = places[used] * np.array([picture["scale"]] * 3 + [1], np.float32)
+        found = descriptors.data[used].astype(np.float32)
+        found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
+        _say("finding features", number + 1, len(job["pictures"]))
+        yield places, found
+
+
+def _matches(job: dict[str, Any], features: list[np.ndarray]) -> dict[tuple[int, int], np.ndarray]:
+    """Match the pictures of each instant and merge what belongs to the same two views.
+
+    Returns:
+        By pairs of views, (M, 2) uint32 numbers of keypoints, which count on over the pictures of a view.
+    """
+    starts = _starts(job, [len(descriptors) for descriptors in features])
+    found: dict[tuple[int, int], list[np.ndarray]] = {}
+
+    def match(pair: tuple[int, int]) -> np.ndarray:
+        return _matched(features[pair[0]], features[pair[1]])
+
+    with ThreadPoolExecutor(job["threads"]) as pool:
+        for number, (pair, matched) in enumerate(zip(job["pairs"], pool.map(match, job["pairs"]), strict=True)):
+            views = tuple(job["pictures"][picture]["view"] for picture in pair)
+            found.setdefault(views, []).append(matched + np.array([starts[picture] for picture in pair], np.uint32))
+            _say("matching", number + 1, len(job["pairs"]))
+    return {views: np.concatenate(parts) for views, parts in found.items()}
+
+
+def _matched(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """Return (M, 2) uint32 numbers of features that are each other's nearest, and much nearer than the second.
+
+    As in COLMAP, whose own matcher takes eight times as long on a processor: angles between descriptors at most
+    FURTHEST, and at most RATIO of that to the second nearest (Lowe, IJCV 2004, section 7.1).
+    """
+    if min(len(one), len(two)) < 2:
+        return np.zeros((0, 2), np.uint32)
+    cosines = one @ two.T  # (N, M) float32
+    nearest, back = cosines.argmax(1), cosines.argmax(0)
+    mutual = np.flatnonzero(back[nearest] == np.arange(len(one)))
+    partners = nearest[mutual]
+    first = np.arccos(np.minimum(cosines[mutual, partners], 1))
+    cosines[mutual, partners] = -1
+    others = np.maximum(cosines.max(1)[mutual], cosines.max(0)[partners])
+    good = (first <= FURTHEST) & (first <= RATIO * np.arccos(np.minimum(others, 1)))
+    return np.stack([mutual[good], partners[good]], axis=1).astype(np.uint32)
+
+
+def _starts(job: dict[str, Any], counts: list[int]) -> list[int]:
+    """Return for each picture the number of its first keypoint among those of its view."""
+    ends: dict[int, int] = {}
+    starts = []
+    for picture, count in zip(job["pictures"], counts, strict=True):
+        starts.append(ends.get(picture["view"], 0))
+        ends[picture["view"]] = starts[-1] + count
+    return starts
+
+
+def _write_views(
+    file: Path, job: dict[str, Any], keypoints: list[np.ndarray], matches: dict[tuple[int, int], np.ndarray]
+) -> None:
+    """Write views, their keypoints and the matches into a new database; numbers count from 1 there."""
+    file.unlink(missing_ok=True)
+    database = pycolmap.Database.open(file)
+    for number, camera in enumerate(job["cameras"], 1):
+        width, height = camera["size"]
+        model = pycolmap.Camera.create_from_model_name(number, FIRST_MODEL, FOCAL * max(width, height), width, height)
+        database.write_camera(model, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=number)
+        rig.add_ref_sensor(model.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+    for number, view in enumerate(job["views"], 1):
+        image = pycolmap.Image(name=view["name"], camera_id=view["camera"] + 1, image_id=number)
+        frame = pycolmap.Frame(frame_id=number, rig_id=view["camera"] + 1)
+        frame.add_data_id(image.data_id)
+        database.write_frame(frame, use_frame_id=True)
+        image.frame_id = number
+        database.write_image(image, use_image_id=True)
+        own = [k for k, picture in zip(keypoints, job["pictures"], strict=True) if picture["view"] == number - 1]
+        database.write_keypoints(number, np.concatenate(own).astype(np.float32))
+    for (one, two), pairs in matches.items():
+        if len(pairs):
+            database.write_matches(one + 1, two + 1, pairs)
+    database.close()
+
+
+def _pairs(file: Path) -> list[tuple[int, int, int, int]]:
+    """Return for each two views that matched: their numbers, the matches, and those that agree with one geometry."""
+    database = pycolmap.Database.open(file)
+    agreeing = dict(zip(*database.read_two_view_geometry_num_inliers(), strict=True))
+    found = []
+    for pair, count in zip(*database.read_num_matches(), strict=True):
+        one, two = pycolmap.pair_id_to_image_pair(pair)
+        found.append((one - 1, two - 1, count, agreeing.get(pair, 0)))
+    database.close()
+    return found
+
+
+def _reconstruct(folder: Path, database: Path, job: dict[str, Any]) -> pycolmap.Reconstruction | None:
+    """Place the views all at once, and one after another where that leaves some out; return the better model.
+
+    Focal lengths are estimated from pairs of views first: with COLMAP's assumption alone, rigs of few views end in a
+    wrong one.
+    """
+    output = folder / "models"
+    output.mkdir(exist_ok=True)
+    pycolmap.calibrate_view_graph(database)
+    total, models = len(job["views"]), []
+    for number, mapper in enumerate((_map_globally, _map_incrementally)):
+        _say("placing cameras", number, 2)
+        models += [model for model in mapper(folder, database, output, job) if model.num_reg_images() >= LEAST_VIEWS]
+        best = max(models, key=lambda model: (model.num_reg_images(), -_mean_error(model)), default=None)
+        if best is not None and best.num_reg_images() == total and _mean_error(best) < GOOD_ERROR:
+            break
+    return best
+
+
+def _map_globally(folder: Path, database: Path, output: Path, job: dict[str, Any]) -> list[pycolmap.Reconstruction]:
+    options = pycolmap.GlobalPipelineOptions(num_threads=job["threads"], random_seed=job["seed"])
+    return list(pycolmap.global_mapping(database, folder, output, options).values())
+
+
+def _map_incrementally(
+    folder: Path, database: Path, output: Path, job: dict[str, Any]
+) -> list[pycolmap.Reconstruction]:
+    options = pycolmap.IncrementalPipelineOptions(
+        min_model_size=LEAST_VIEWS, num_threads=job["threads"], random_seed=job["seed"], extract_colors=False
+    )
+    return list(pycolmap.incremental_mapping(database, folder, output, options).values())
+
+
+def _mean_error(model: pycolmap.Reconstruction) -> float:
+    return float(model.compute_mean_reprojection_error())
+
+
+def _with_best_cameras(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Return the model adjusted with the cameras that its points speak for: how many parameters, shared or not."""
+    best, least = model, np.inf
+    for shared in (True, False):
+        for name in MODELS:
+            tried = _with_cameras(model, name, shared)
+            pycolmap.bundle_adjustment(tried, pycolmap.BundleAdjustmentOptions(print_summary=False))
+            measure = _criterion(tried)
+            if measure < least:
+                best, least = tried, measure
+            elif name != MODELS[0] or not shared:
+                break  # more parameters do not help
+    return best
+
+
+def _criterion(model: pycolmap.Reconstruction) -> float:
+    """Return n log(mean squared error) + EVIDENCE k log(n) of n coordinates and k parameters of cameras."""
+    if any(camera.has_bogus_params(0.1, 10.0, 1.0) for camera in model.cameras.values()):
+        return np.inf
+    errors = _errors(model)
+    parameters = sum(len(camera.params) - 2 for camera in model.cameras.values())  # but the principal point
+    count = 2 * len(errors)
+    return float(count * np.log((errors**2).mean()) + EVIDENCE * parameters * np.log(count))
+
+
+def _with_cameras(model: pycolmap.Reconstruction, name: str, shared: bool) -> pycolmap.Reconstruction:
+    """Return a copy with other camera models, which begin with the focal length found and without distortion."""
+    copy = pycolmap.Reconstruction()
+    cameras: set[int] = set()
+    for number in model.reg_image_ids():
+        image = model.images[number]
+        key = image.camera_id if shared else number
+        if key not in cameras:
+            own = model.cameras[image.camera_id]
+            camera = pycolmap.Camera.create_from_model_name(key, name, own.mean_focal_length(), own.width, own.height)
+            copy.add_camera_with_trivial_rig(camera)
+            cameras.add(key)
+        places = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+        copied = pycolmap.Image(name=image.name, keypoints=places, camera_id=key, image_id=number)
+        copy.add_image_with_trivial_frame(copied, image.cam_from_world())
+    for point in model.points3D.values():
+        copy.add_point3D(point.xyz, point.track)
+    return copy
+
+
+def _errors(model: pycolmap.Reconstruction) -> np.ndarray:
+    """Return the distance in pixels of each observation from its projected point."""
+    return np.array(
+        [
+            np.hypot(*(observed - projected))
+            for number in model.reg_image_ids()
+            for observed, projected in _projections(model, model.images[number])
+        ]
+    )
+
+
+def _projections(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    for point in image.get_observation_points2D():
+        projected = image.project_point(model.points3D[point.point3D_id].xyz)
+        if projected is not None:
+            yield point.xy, projected
+
+
+def _views(model: pycolmap.Reconstruction) -> dict[str, Any]:
+    """Describe the placed views by their numbers."""
+    found = {}
+    for number in model.reg_image_ids():
+        image = model.images[number]
+        camera = model.cameras[image.camera_id]
+        errors = [float(np.hypot(*(seen - projected))) for seen, projected in _projections(model, image)]
+        found[str(number - 1)] = {
+            "camera_from_world": image.cam_from_world().matrix().tolist(),
+            "model": camera.model_name,
+            "parameters": dict(zip(camera.params_info.split(", "), map(float, camera.params), strict=True)),
+            "points": len(errors),
+            "error": float(np.mean(errors)) if errors else None,
+        }
+    return found
+
+
+def _points(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    """Return points (N, 3) float64 and, for each time that one is seen, its number, the view, x and y (M, 4)."""
+    points = list(model.points3D.values())
+    seen = [
+        (number, element.image_id - 1, *model.images[element.image_id].points2D[element.point2D_idx].xy)
+        for number, point in enumerate(points)
+        for element in point.track.elements
+    ]
+    return {
+        "points": np.array([point.xyz for point in points]).reshape(-1, 3),
+        "observations": np.array(seen, np.float64).reshape(-1, 4),
+    }
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,202 @@
+"""From bare footage to cameras and clocks: what `kpposes` does, and `kpenc` for a folder without poses."""
+
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kpc.encoder.datasets.capture import first_names
+from kpc.encoder.poses.footage import Footage, find_footage
+from kpc.encoder.poses.instants import Picture, grey_of, moving_pictures, still_pictures
+from kpc.encoder.poses.orientation import extent, oriented
+from kpc.encoder.poses.structure import PlacedView, Structure, reconstruct
+from kpc.encoder.poses.survey import Survey, frame_count, greys, survey
+from kpc.encoder.poses.sync import UNKNOWN, Clock, synchronise
+from kpc.encoder.poses.wishes import Wishes
+from kpc.format.common.errors import DatasetError
+from kpc.format.common.images import read_image
+from kpc.format.common.progress import progress
+
+# Attempts at a still rig: features in each picture, and instants at which what moves is matched.
+ATTEMPTS = ((4096, 4), (8192, 10))
+# Features in each picture of a moving camera or a collection, where there are more pictures than this: fewer.
+MANY, FEATURES_OF_MANY = 100, 2048
+# Pictures of one moving camera are matched with so many before and after them, and some further away.
+NEIGHBOURS = 8
+# A scene cannot be made from fewer cameras.
+LEAST_CAMERAS = 3
+# Pairs of cameras are named as matching if so many features agree.
+MATCHED = 15
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found.
+
+    Attributes:
+        kind: what the footage was taken for: "still rig", "moving camera" or "photographs".
+        footage: of each camera; of each photograph in a collection.
+        clocks: of each camera.
+        view_names: of the views: cameras, or pictures of a moving one.
+        structure: z up; the rig's extent is 1 unless `is_metric`.
+        is_metric: whether the unit is the metre.
+    """
+
+    kind: str
+    footage: tuple[Footage, ...]
+    clocks: tuple[Clock, ...]
+    view_names: tuple[str, ...]
+    structure: Structure
+    is_metric: bool
+
+
+def find_poses(root: Path, wishes: Wishes) -> Found:
+    """Find cameras and clocks of the footage in a folder; say in one line what it is taken for.
+
+    Raises:
+        DatasetError: the footage cannot be used, or fewer than LEAST_CAMERAS views could be placed.
+        MediaError: a file cannot be read.
+    """
+    footage = find_footage(root)
+    if all(frame_count(one) == 1 for one in footage):
+        print(f"{root}: taken for photographs of one scene ({len(footage)} images)", file=sys.stderr)
+        found = _find_photographs(root, footage)
+    else:
+        surveys = [survey(one) for one in progress(footage, "looking at what moves", unit="camera")]
+        moving = [one.name for one, seen in zip(footage, surveys, strict=True) if not seen.is_still]
+        is_still = not moving if wishes.rig == "auto" else wishes.rig == "still"
+        print(f"{root}: {_what(footage, surveys, is_still, wishes.rig)}", file=sys.stderr)
+        if is_still:
+            found = _find_still_rig(root, footage, surveys, wishes)
+        elif len(footage) == 1:
+            found = _find_moving_camera(root, footage[0])
+        else:
+            raise DatasetError(
+                f"{root}: several cameras that move ({first_names(moving)}) are not supported yet; give one video, or "
+                "--rig still if they do not move"
+            )
+    _check(root, found, wishes.require_all)
+    return _scaled(root, found, wishes)
+
+
+def _what(footage: Sequence[Footage], surveys: Sequence[Survey], is_still: bool, rig: str) -> str:
+    shares = [f"{seen.still_share:.0%}" for seen in surveys if np.isfinite(seen.still_share)]
+    why = "as --rig says" if rig != "auto" else f"{min(shares, default='?')} of a picture's texture stays, or more"
+    if is_still:
+        return f"taken for a rig of {len(footage)} cameras that stand still ({why})"
+    return f"taken for {'a camera that moves' if len(footage) == 1 else 'cameras that move'} ({why})"
+
+
+def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Survey], wishes: Wishes) -> Found:
+    if len(footage) < LEAST_CAMERAS:
+        raise DatasetError(
+            f"{root}: {len(footage)} camera{'s' * (len(footage) > 1)} that stand still: depth needs {LEAST_CAMERAS} or "
+            "more; film with more cameras, or walk around with one"
+        )
+    clocks = synchronise(footage, surveys, wishes.sync)
+    best: Structure | None = None
+    names = [one.name for one in footage]
+    lenses = _lenses([seen.median.shape for seen in surveys])
+    for features, instants in ATTEMPTS:
+        pictures = [*still_pictures(surveys), *moving_pictures(footage, surveys, clocks, instants)]
+        structure = reconstruct(sorted(pictures, key=lambda picture: picture.view), names, lenses, features)
+        if best is None or (len(structure.views), -structure.error) > (len(best.views), -best.error):
+            best = structure
+        if len(best.views) == len(footage):
+            break
+        print(
+            f"{root}: {len(best.views)} of {len(footage)} cameras placed; trying again with more features",
+            file=sys.stderr,
+        )
+    assert best is not None
+    return Found("still rig", footage, tuple(clocks), tuple(names), best, False)
+
+
+def _find_moving_camera(root: Path, footage: Footage) -> Found:
+    count = frame_count(footage)
+    names = [f"{number:06d}" for number in range(count)]
+    pictures = (Picture(number, 0, grey.round().astype(np.uint8), None) for number, grey in enumerate(greys(footage)))
+    structure = reconstruct(
+        pictures, names, [0] * count, FEATURES_OF_MANY if count > MANY else ATTEMPTS[0][0], NEIGHBOURS
+    )
+    return Found("moving camera", (footage,), (UNKNOWN,), tuple(names), structure, False)
+
+
+def _find_photographs(root: Path, footage: tuple[Footage, ...]) -> Found:
+    def pictures() -> Iterator[Picture]:
+        for number, one in enumerate(footage):
+            yield Picture(number, 0, grey_of(read_image(one.files[0], upright=True)), None)
+
+    shapes = [picture.grey.shape for picture in pictures()]
+    features = FEATURES_OF_MANY if len(footage) > MANY else ATTEMPTS[0][0]
+    structure = reconstruct(pictures(), [one.name for one in footage], _lenses(shapes), features)
+    clocks = (UNKNOWN,) * len(footage)
+    return Found("photographs", footage, clocks, tuple(one.name for one in footage), structure, False)
+
+
+def _lenses(shapes: Sequence[tuple[int, ...]]) -> list[int]:
+    """Return the number of each view's lens, to begin with: views of one size share it."""
+    distinct = list(dict.fromkeys(shapes))
+    return [distinct.index(shape) for shape in shapes]
+
+
+def _check(root: Path, found: Found, require_all: bool) -> None:
+    """Name the views that could not be placed, and refuse if too few were."""
+    names, structure = found.view_names, found.structure
+    missing = [number for number in range(len(names)) if number not in structure.views]
+    if not missing:
+        return
+    matched = {number: _neighbours(structure, number) for number in missing}
+    said = [
+        f"{names[number]} ("
+        + (f"matches only {first_names([names[n] for n in near])}" if near else "matches none")
+        + ")"
+        for number, near in matched.items()
+    ]
+    noun = "cameras" if found.kind == "still rig" else "pictures"
+    placed = f"{len(structure.views)} of {len(names)} {noun} could be placed"
+    advice = "film with more overlap, more texture and sharper pictures"
+    if len(structure.views) < LEAST_CAMERAS:
+        raise DatasetError(f"{root}: {placed}, too few: {first_names(said)}; {advice}")
+    if require_all:
+        raise DatasetError(f"{root}: {placed}; left out: {first_names(said)}; {advice}, or drop --require-all")
+    print(f"{root}: {placed}; left out: {first_names(said)}", file=sys.stderr)
+
+
+def _neighbours(structure: Structure, number: int) -> list[int]:
+    agreeing = {
+        (two if one == number else one): count
+        for (one, two), (_, count) in structure.pairs.items()
+        if number in (one, two) and count >= MATCHED
+    }
+    return sorted(agreeing, key=lambda other: -agreeing[other])
+
+
+def _scaled(root: Path, found: Found, wishes: Wishes) -> Found:
+    views = found.structure.views
+    size = extent(np.stack([view.camera_to_world for view in views.values()]))
+    if size <= 0:
+        raise DatasetError(f"{root}: all cameras were found at one place; move the camera while filming")
+    scale, is_metric = 1 / size, wishes.distance is not None
+    if wishes.distance is not None:
+        one, two, metres = wishes.distance
+        numbers = [found.view_names.index(name) if name in found.view_names else -1 for name in (one, two)]
+        if any(number not in views for number in numbers):
+            raise DatasetError(f"{root}: --distance {one},{two}: both must be cameras that were placed")
+        first, second = (views[number].camera_to_world[:3, 3] for number in numbers)
+        scale = metres / max(float(np.linalg.norm(first - second)), 1e-12)
+    structure = oriented(found.structure, scale)
+    return Found(found.kind, found.footage, found.clocks, found.view_names, structure, is_metric)
+
+
+def depth_range(structure: Structure, number: int, view: PlacedView) -> tuple[float, float] | None:
+    """Return nearest and furthest depth of the points that a view sees, with a margin; None if it sees too few."""
+    own = structure.observations[structure.observations[:, 1] == number, 0].astype(int)
+    if len(own) < 10:
+        return None
+    inverse = np.linalg.inv(view.camera_to_world)
+    depths = -(structure.points[own] @ inverse[2, :3] + inverse[2, 3])
+    near, far = np.quantile(depths, (0.01, 0.99))
+    return (0.8 * float(near), 1.25 * float(far)) if near > 0 else None

@@ -1,0 +1,81 @@
+"""What a folder without poses holds: a video for each camera, folders of frames, or photographs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from kpc.encoder.datasets.capture import natural_key
+from kpc.encoder.datasets.left_out import media_in
+from kpc.encoder.datasets.video import VideoInfo, video_info
+from kpc.format.common.errors import DatasetError
+from kpc.format.common.media_files import is_hidden, is_image, is_video
+
+# Folders of frames have at least as many images; fewer are photographs.
+LEAST_FRAMES = 5
+
+
+@dataclass(frozen=True)
+class Footage:
+    """What one camera filmed.
+
+    Attributes:
+        name: of the camera: its video's name without suffix, or its folder's.
+        files: a video, or images in the order of time.
+        video: properties of the video; None for images.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+    video: VideoInfo | None
+
+
+def find_footage(root: Path) -> tuple[Footage, ...]:
+    """Return what each camera filmed, in the order of names; one entry for each photograph of a collection.
+
+    Raises:
+        DatasetError: the folder holds nothing of these kinds, or several.
+        MediaError: a video cannot be read.
+    """
+    videos, folders = _videos(root), _frame_folders(root)
+    images = [file for file in media_in(root) if is_image(file)]
+    if videos:
+        return tuple(Footage(name, (file,), video_info(file)) for name, file in videos.items())
+    if folders:
+        return tuple(Footage(name, files, None) for name, files in folders.items())
+    images = images or [file for file in _of_only_folder(root) if is_image(file)]
+    if len(images) < 3:
+        raise DatasetError(
+            f"{root}: holds no videos, folders of frames, or three photographs; give a video for each camera"
+        )
+    return tuple(Footage(file.stem, (file,), None) for file in sorted(images, key=lambda file: natural_key(file.name)))
+
+
+def _videos(root: Path) -> dict[str, Path]:
+    """Return the videos of a folder, or else those of its folders, which then name the cameras."""
+    found = [file for file in media_in(root) if is_video(file)]
+    if not found:
+        found = [file for folder in _folders(root) for file in media_in(folder) if is_video(file)]
+    parents = [file.parent for file in found]
+    by_folder = bool(found) and found[0].parent != root and len(set(parents)) == len(parents)
+    files = {(file.parent.name if by_folder else file.stem): file for file in found}
+    if len(files) < len(found):
+        twice = next(file for file in found if file not in files.values())
+        raise DatasetError(f"{root}: two videos are named {twice.stem}; give each camera a name of its own")
+    return {name: files[name] for name in sorted(files, key=natural_key)}
+
+
+def _frame_folders(root: Path) -> dict[str, tuple[Path, ...]]:
+    found = {}
+    for folder in _folders(root):
+        images = [file for file in media_in(folder) if is_image(file)]
+        if len(images) >= LEAST_FRAMES:
+            found[folder.name] = tuple(sorted(images, key=lambda file: natural_key(file.name)))
+    return {name: found[name] for name in sorted(found, key=natural_key)} if len(found) > 1 else {}
+
+
+def _of_only_folder(root: Path) -> list[Path]:
+    folders = [folder for folder in _folders(root) if any(map(is_image, folder.iterdir()))]
+    return media_in(folders[0]) if len(folders) == 1 else []
+
+
+def _folders(root: Path) -> list[Path]:
+    return sorted(folder for folder in root.iterdir() if folder.is_dir() and not is_hidden(folder))

@@ -1,0 +1,201 @@
+"""Cameras and points from pictures: runs `colmap_worker` and reads what it found."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kpc.encoder.poses.instants import Picture
+from kpc.format.common.errors import DatasetError
+from kpc.format.common.progress import Progress
+
+# The larger side of pictures in which features are looked for, pixels; more are averaged down.
+LARGEST_SIDE = 1600
+
+SEED = 0
+
+
+@dataclass(frozen=True)
+class PlacedView:
+    """A view whose camera was found.
+
+    Attributes:
+        camera_to_world: (4, 4) float64, OpenGL convention.
+        intrinsics: fl_x fl_y cx cy in pixels of the picture.
+        distortion: k1 k2 p1 p2 of OpenCV's lens model.
+        points: number of points that it sees.
+        error: mean distance in pixels between projected points and where they were found.
+    """
+
+    camera_to_world: np.ndarray
+    intrinsics: tuple[float, float, float, float]
+    distortion: tuple[float, float, float, float]
+    points: int
+    error: float
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What structure from motion found.
+
+    Attributes:
+        views: those that were placed, by number.
+        points: (N, 3) float64.
+        observations: (M, 4) float64: number of the point, of the view, x and y in its picture.
+        pairs: for each two views that match, how many features match and how many of these agree with one geometry.
+    """
+
+    views: dict[int, PlacedView]
+    points: np.ndarray
+    observations: np.ndarray
+    pairs: dict[tuple[int, int], tuple[int, int]]
+
+    @property
+    def error(self) -> float:
+        """Mean reprojection error over the views, pixels."""
+        return float(np.mean([view.error for view in self.views.values()])) if self.views else float("inf")
+
+
+def reconstruct(
+    pictures: Iterable[Picture],
+    names: Sequence[str],
+    cameras: Sequence[int],
+    features: int,
+    neighbours: int | None = None,
+) -> Structure:
+    """Find cameras and points.
+
+    Args:
+        pictures: of all views.
+        names: of the views.
+        cameras: the number of each view's camera; views of one camera share its lens.
+        features: at most, in each picture.
+        neighbours: match views whose numbers differ by no more than this, and a few far ones; None for all.
+
+    Raises:
+        DatasetError: COLMAP is not installed, or it failed.
+    """
+    with tempfile.TemporaryDirectory(prefix="kpposes-") as name:
+        folder = Path(name)
+        described, scales = [], {}
+        sizes: dict[int, tuple[int, int]] = {}
+        for number, picture in enumerate(pictures):
+            factor = -(-max(picture.grey.shape) // LARGEST_SIDE)
+            np.save(folder / f"{number}.npy", _smaller(picture.grey, factor))
+            if picture.mask is not None:
+                np.save(folder / f"{number}-mask.npy", picture.mask[::factor, ::factor])
+            scales[picture.view] = factor
+            sizes[cameras[picture.view]] = picture.grey.shape[1], picture.grey.shape[0]
+            described.append(
+                {
+                    "view": picture.view,
+                    "instant": picture.instant,
+                    "file": f"{number}.npy",
+                    "mask": None if picture.mask is None else f"{number}-mask.npy",
+                    "scale": factor,
+                }
+            )
+        job = {
+            "seed": SEED,
+            "features": features,
+            "threads": os.cpu_count() or 1,
+            "pictures": described,
+            "views": [{"name": name, "camera": camera} for name, camera in zip(names, cameras, strict=True)],
+            "cameras": [{"size": sizes[number]} for number in sorted(sizes)],
+            "pairs": _pairs(described, neighbours),
+        }
+        (folder / "job.json").write_text(json.dumps(job))
+        _run_worker(folder)
+        return _read(folder)
+
+
+def _smaller(grey: np.ndarray, factor: int) -> np.ndarray:
+    if factor == 1:
+        return grey
+    rows, columns = (size // factor for size in grey.shape)
+    blocks = grey[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
+    return np.asarray(blocks.mean((1, 3)).round(), np.uint8)
+
+
+def _pairs(pictures: list[dict], neighbours: int | None) -> list[tuple[int, int]]:
+    """Return the pairs of pictures to be matched: those of one instant, or near ones of a moving camera."""
+    found = []
+    for a, one in enumerate(pictures):
+        for b in range(a + 1, len(pictures)):
+            two = pictures[b]
+            apart = abs(two["view"] - one["view"])
+            near = neighbours is None or apart <= neighbours or apart & (apart - 1) == 0
+            if one["instant"] == two["instant"] and one["view"] != two["view"] and near:
+                found.append((a, b) if one["view"] < two["view"] else (b, a))
+    return found
+
+
+def _run_worker(folder: Path) -> None:
+    command = [sys.executable, "-m", "kpc.encoder.poses.colmap_worker", str(folder)]
+    with (
+        (folder / "log").open("w") as log,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True) as process,
+    ):
+        assert process.stdout is not None
+        try:
+            _show_progress(process.stdout)
+        except BaseException:
+            process.kill()
+            raise
+    if process.returncode:
+        said = (folder / "log").read_text(errors="replace")
+        if "No module named 'pycolmap'" in said:
+            raise DatasetError('finding cameras needs COLMAP: pip install "kpc[poses]"')
+        last = said.strip().splitlines()[-1:] or ["no message"]
+        raise DatasetError(f"COLMAP ended with code {process.returncode} ({last[0][:200]}); try again, or report it")
+
+
+def _show_progress(lines: Iterable[str]) -> None:
+    step, bar = "", None
+    try:
+        for line in lines:
+            try:
+                said = json.loads(line)
+            except ValueError:
+                continue  # COLMAP's own messages
+            if said["step"] != step:
+                if bar is not None:
+                    bar.__exit__(None, None, None)
+                step = said["step"]
+                bar = Progress(step, said["total"])
+            assert bar is not None
+            bar.advance(max(said["done"] - bar.done, 0))
+    finally:
+        if bar is not None:
+            bar.__exit__(None, None, None)
+
+
+def _read(folder: Path) -> Structure:
+    found = json.loads((folder / "result.json").read_text())
+    arrays = np.load(folder / "result.npz")
+    views = {}
+    for number, view in found["views"].items():
+        camera_from_world = np.vstack([np.array(view["camera_from_world"]), [0, 0, 0, 1]])
+        camera_to_world = np.linalg.inv(camera_from_world)
+        camera_to_world[:3, 1:3] *= -1  # OpenCV's camera looks along z with y down
+        lens = view["parameters"]
+        views[int(number)] = PlacedView(
+            camera_to_world,
+            (lens.get("fx", lens.get("f")), lens.get("fy", lens.get("f")), lens["cx"], lens["cy"]),
+            (lens.get("k1", lens.get("k", 0.0)), lens.get("k2", 0.0), lens.get("p1", 0.0), lens.get("p2", 0.0)),
+            view["points"],
+            view["error"],
+        )
+    empty = np.zeros((0, 3))
+    return Structure(
+        views,
+        arrays["points"] if "points" in arrays else empty,
+        arrays["observations"] if "observations" in arrays else np.zeros((0, 4)),
+        {(one, two): (matches, agreeing) for one, two, matches, agreeing in found["pairs"]},
+    )

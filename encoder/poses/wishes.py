@@ -1,0 +1,58 @@
+"""What the user may say about footage without poses, and the options that say it."""
+
+import argparse
+import math
+from dataclasses import dataclass
+
+RIGS = ("auto", "still", "moving")
+SYNC_MODES = ("auto", "audio", "motion", "none")
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What the user says about footage without poses.
+
+    Attributes:
+        rig: one of RIGS: whether cameras move.
+        sync: one of SYNC_MODES: how videos are brought in step.
+        distance: two cameras' names, and how far apart they are in metres; None if unknown.
+        require_all: whether to refuse if a camera cannot be placed.
+    """
+
+    rig: str = "auto"
+    sync: str = "auto"
+    distance: tuple[str, str, float] | None = None
+    require_all: bool = False
+
+
+def add_pose_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options from which `wishes_from` makes wishes."""
+    group = parser.add_argument_group("footage without poses")
+    group.add_argument("--rig", choices=RIGS, default=Wishes.rig, help="whether cameras move (default: %(default)s)")
+    group.add_argument(
+        "--sync", choices=SYNC_MODES, default=Wishes.sync, help="how videos are brought in step (default: %(default)s)"
+    )
+    group.add_argument(
+        "--distance",
+        type=_distance,
+        metavar="A,B=METRES",
+        help="how far two cameras are apart; without it, the largest distance between cameras is 1",
+    )
+    group.add_argument("--require-all", action="store_true", help="fail if a camera cannot be placed")
+
+
+def wishes_from(given: argparse.Namespace) -> Wishes:
+    """Return what parsed options say."""
+    return Wishes(given.rig, given.sync, given.distance, given.require_all)
+
+
+def _distance(text: str) -> tuple[str, str, float]:
+    names, _, metres = text.rpartition("=")
+    one, _, two = names.partition(",")
+    try:
+        value = float(metres)
+    except ValueError:
+        value = math.nan
+    if not (one and two and one != two and 0 < value < math.inf):
+        raise argparse.ArgumentTypeError(f"{text!r} is not two cameras and a distance, such as cam00,cam05=1.2")
+    return one, two, value

@@ -1,0 +1,137 @@
+"""Cameras of bare videos: what a folder is taken for, structure from motion, the document and reading it back."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kpc.encoder.datasets import load_dataset
+from kpc.encoder.poses.footage import find_footage
+from kpc.format.common.errors import DatasetError
+from textured_room import FOCAL, FPS, SIZE, rig, write_films
+from videos import film
+
+pytest.importorskip("pycolmap", reason="needs pycolmap, of the extra poses")
+pytest.importorskip("scipy", reason="needs scipy, of the extra poses")
+
+from kpc.encoder.cli import kpposes
+from kpc.encoder.poses.orientation import looked_at, up_direction
+
+LATE = (0, 7, 0, 3, 12)  # frames
+CAMERAS = rig(5, LATE)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of five films that begin at different times, and nothing else."""
+    folder = tmp_path_factory.mktemp("bare") / "room"
+    write_films(folder, CAMERAS, 70)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def document(room: Path) -> dict:
+    """What `kpposes` writes about it."""
+    file = room.parent / "transforms.json"
+    assert kpposes.main([str(room), "-o", str(file), "--distance", "cam00,cam04=1.5"]) == 0
+    return json.loads(file.read_text())
+
+
+def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest distance of centres as a share of the rig's extent, and angle in degrees, after alignment."""
+    u, _, v = np.linalg.svd(sum(true[:, :3, :3] @ found[:, :3, :3].transpose(0, 2, 1)))
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+    a, b = found[:, :3, 3] @ turn.T, true[:, :3, 3]
+    a, b = a - a.mean(0), b - b.mean(0)
+    centres = np.linalg.norm(a * (a * b).sum() / (a * a).sum() - b, axis=1).max()
+    trace = np.einsum("nij,nij->n", true[:, :3, :3], turn @ found[:, :3, :3])
+    return centres / np.linalg.norm(np.ptp(b, axis=0)), np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))).max()
+
+
+def test_all_cameras_of_a_still_rig_are_placed(document):
+    frames = document["frames"]
+    assert [frame["file_path"] for frame in frames] == [f"{camera.name}.mp4" for camera in CAMERAS]
+    poses = np.array([frame["transform_matrix"] for frame in frames])
+    centres, angle = aligned(poses, np.stack([camera.pose for camera in CAMERAS]))
+    assert centres < 0.01 and angle < 0.2
+    assert frames[0]["fl_x"] == pytest.approx(FOCAL, rel=0.03)
+    assert [frames[0]["w"], frames[0]["h"]] == list(SIZE)
+
+
+def test_videos_are_brought_in_step_by_what_moves(document):
+    offsets = np.array([frame.get("time_offset", 0.0) for frame in document["frames"]])
+    assert offsets - offsets[0] == pytest.approx(np.array(LATE) / FPS, abs=0.5 / FPS)
+
+
+def test_the_world_is_upright_and_in_metres(document):
+    poses = np.array([frame["transform_matrix"] for frame in document["frames"]])
+    assert np.linalg.norm(poses[0, :3, 3] - poses[4, :3, 3]) == pytest.approx(1.5, rel=1e-6)
+    assert np.abs(poses[:, 2, 0]).max() < 0.02  # no camera is rolled
+    assert document["unit"] == "metre"
+    near, far = (np.array([frame[key] for frame in document["frames"]]) for key in ("near", "far"))
+    assert (0 < near).all() and (near < far).all()
+
+
+def test_the_document_is_read_back_with_its_clocks(room, document, tmp_path):
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps(document))
+    dataset = load_dataset(room, tmp_path / "cache", progress=False, transforms=file)
+    assert dataset.clip.fps == FPS
+    assert dataset.clip.frame_count == 70 - max(LATE)
+    assert not dataset.pictures.is_test.any()
+    assert dataset.clocks["cam04.mp4"][0] == document["frames"][4]["time_offset"]
+    held_out = load_dataset(room, tmp_path / "cache", progress=False, transforms=file, holdout="cam02")
+    assert {held_out.pictures.file[k] for k in np.flatnonzero(held_out.pictures.is_test)} == {"cam02.mp4"}
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"time_rate": 3.0}, "is that of no clock"),
+        ({"w": None}, "needs w and h"),
+        ({"near": 5.0, "far": 1.0}, "near"),
+    ],
+)
+def test_a_document_that_makes_no_sense_is_refused(room, document, tmp_path, change, said):
+    document = json.loads(json.dumps(document))
+    frame = document["frames"][1] | change
+    document["frames"][1] = {key: value for key, value in frame.items() if value is not None}
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps(document))
+    with pytest.raises(DatasetError, match=said):
+        load_dataset(room, tmp_path / "cache", progress=False, transforms=file)
+
+
+def test_two_cameras_are_too_few(tmp_path, capsys):
+    for name in ("a", "b"):
+        film(tmp_path / f"{name}.mp4")
+    assert kpposes.main([str(tmp_path), "--rig", "still"]) == 1
+    assert "2 cameras that stand still: depth needs 3 or more" in capsys.readouterr().err
+
+
+def test_what_cannot_be_matched_is_named(tmp_path, capsys):
+    for name in ("a", "b", "c"):
+        film(tmp_path / f"{name}.mp4")  # patches of colour without texture
+    assert kpposes.main([str(tmp_path), "--rig", "still"]) == 1
+    said = capsys.readouterr().err
+    assert "0 of 3 cameras could be placed, too few: a (matches none)" in said
+    assert not (tmp_path / "transforms.json").exists()
+
+
+def test_cameras_are_named_by_their_folders(tmp_path):
+    for name in ("left", "right"):
+        (tmp_path / name).mkdir()
+        film(tmp_path / name / "GOPR0001.MP4")
+    assert [footage.name for footage in find_footage(tmp_path)] == ["left", "right"]
+
+
+def test_an_empty_folder_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match="holds no videos"):
+        find_footage(tmp_path)
+
+
+def test_up_is_across_the_cameras_horizons_and_the_origin_where_they_look():
+    poses = np.stack([camera.pose for camera in CAMERAS])
+    assert up_direction(poses) == pytest.approx([0, 0, 1], abs=1e-9)
+    assert looked_at(poses) == pytest.approx([0, 0, 0.6], abs=1e-9)

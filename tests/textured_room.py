@@ -1,0 +1,90 @@
+"""Films of a textured corner of a room by a still rig, for finding its cameras; a block moves before the walls."""
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from videos import ffmpeg
+
+SIZE = WIDTH, HEIGHT = 256, 192
+FOCAL = 240.0
+FPS = 20.0
+
+
+@dataclass(frozen=True)
+class RigCamera:
+    """A camera: its name, camera to world in the OpenGL convention (4, 4), and by how many frames its film is late."""
+
+    name: str
+    pose: np.ndarray
+    late: int
+
+
+def rig(count: int = 5, late: tuple[int, ...] = ()) -> list[RigCamera]:
+    """Return cameras on an arc of 12 degrees a step, 4 m from the origin, z up."""
+    cameras = []
+    for number in range(count):
+        azimuth, height = np.radians(12.0 * (number - (count - 1) / 2)), 1.2 + 0.25 * (number % 2)
+        centre = np.array([4 * np.sin(azimuth), -4 * np.cos(azimuth), height])
+        back = (centre - [0, 0, 0.6]) / np.linalg.norm(centre - [0, 0, 0.6])
+        right = np.cross([0, 0, 1], back) / np.linalg.norm(np.cross([0, 0, 1], back))
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(back, right), back, centre], axis=1)
+        cameras.append(RigCamera(f"cam{number:02d}", pose, late[number] if late else 0))
+    return cameras
+
+
+def write_films(folder: Path, cameras: list[RigCamera], frames: int) -> None:
+    """Write the film of each camera as NAME.mp4; one that is late lacks the first frames of the take."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for camera in cameras:
+        still = _walls(camera)
+        raw = b"".join(_with_block(still, camera, number / FPS).tobytes() for number in range(camera.late, frames))
+        source = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", FPS, "-i", "pipe:")
+        ffmpeg(*source, "-c:v", "libx264", "-crf", 8, "-pix_fmt", "yuv420p", folder / f"{camera.name}.mp4", frames=raw)
+
+
+@functools.cache
+def _texture(seed: int) -> np.ndarray:
+    """Return (256, 256, 3) uint8 blobs of several sizes."""
+    noise = np.random.default_rng(seed).standard_normal((256, 256, 3))
+    blobs = sum(4 * ndimage.gaussian_filter(noise, (s, s, 0)) * s for s in (1.5, 3.0, 6.0))
+    return np.clip(128 + 35 * blobs, 0, 255).astype(np.uint8)
+
+
+def _walls(camera: RigCamera) -> np.ndarray:
+    """Return the picture of floor, back and side wall, (H, W, 3) float64, by intersecting rays with the three."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = (
+        np.stack([(x - WIDTH / 2) / FOCAL, -(y - HEIGHT / 2) / FOCAL, -np.ones_like(x)], axis=-1)
+        @ camera.pose[:3, :3].T
+    )
+    centre, picture, nearest = camera.pose[:3, 3], np.zeros((HEIGHT, WIDTH, 3)), np.full((HEIGHT, WIDTH), np.inf)
+    for axis, level, along, seed in ((2, 0.0, (0, 1), 1), (1, 1.6, (0, 2), 2), (0, -1.8, (1, 2), 3)):
+        with np.errstate(divide="ignore"):
+            depth = (level - centre[axis]) / rays[..., axis]
+        hit = (depth > 0) & (depth < nearest)
+        place = (centre + np.where(hit, depth, 0.0)[..., None] * rays)[..., along] * 128
+        column, row = np.moveaxis(place.astype(int) % 256, -1, 0)
+        colours = _texture(seed)[row, column]
+        picture[hit], nearest[hit] = colours[hit], depth[hit]
+    return picture
+
+
+def _with_block(still: np.ndarray, camera: RigCamera, time: float) -> np.ndarray:
+    """Return a frame, (H, W, 3) uint8: a bright block jumps about above the floor, faster at times."""
+    phase = 2.5 * time + 0.9 * np.sin(3.1 * time) + 0.4 * np.sin(7.3 * time)
+    place = np.array([0.8 * np.sin(phase), 0.4 * np.cos(1.7 * phase), 0.7 + 0.2 * np.sin(2.3 * phase)])
+    seen = np.linalg.inv(camera.pose) @ [*place, 1]
+    u, v = (WIDTH / 2 - FOCAL * seen[0] / seen[2], HEIGHT / 2 + FOCAL * seen[1] / seen[2])
+    side = int(0.45 * FOCAL / -seen[2])
+    block = np.asarray(Image.fromarray(_texture(9)).resize((side, side)))
+    frame = still.copy()
+    left, top = int(u - side / 2), int(v - side / 2)
+    part = frame[max(top, 0) : top + side, max(left, 0) : left + side]
+    part[...] = 255 - block[: part.shape[0], : part.shape[1]] // 2
+    return frame.astype(np.uint8)
