@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import kpc
@@ -9,7 +10,7 @@ from kpc.format.scene.rig import Rig
 from kpc.player.cpu.reference import render
 from kpc.player.quality import LEVELS
 from kpc.player.viewpoints import fit_camera
-from kpc.tools.bench import web_bench, web_page
+from kpc.tools.bench import web_bench, web_loading, web_page
 from partial_scenes import coded
 from scenes import tiny_scene
 
@@ -31,3 +32,11 @@ def test_look_ups_are_those_of_the_samples(tmp_path: Path) -> None:
     assert folded["texels_per_pixel"] < exact["texels_per_pixel"] and folded["psnr"] > 45
     assert exact["cells_per_ray"] >= exact["samples_per_ray"]
     assert {device for record in found.values() for device in record["chosen_on"]} == set(web_bench.DEVICES)
+
+
+def test_the_other_player_shows_as_many_bytes() -> None:
+    scene = tiny_scene(4)
+    splats = web_loading.splats_of(scene, 20)
+    assert splats.nbytes == 20 * 32
+    assert np.all((splats["place"] >= scene.aabb[0]) & (splats["place"] <= scene.aabb[1]))
+    assert np.all(splats["extent"] > 0) and splats["colour"][:, :3].std() > 1

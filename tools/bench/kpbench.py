@@ -10,6 +10,7 @@
     kpbench window room.kpc liam.kpc --out docs/bench/window.json
     kpbench steady room.kpc liam.kpc --out docs/bench/steady.json
     kpbench web room.kpc liam.kpc --out docs/bench/web.json
+    kpbench web default.kpc --loading --repeats 3 --out docs/bench/webload.json
     kpbench codec room.kpck liam.kpc --dataset room --dataset liam --out docs/bench/codec.json
     kpbench entropy room.kpc liam.kpc --out docs/bench/entropy.json
     kpbench decode room.kpc liam.kpc --out docs/bench/decode.json

@@ -8,7 +8,7 @@ from typing import Any
 
 from kpc.format.container import scene_io
 from kpc.player.quality import DEFAULT, LEVELS
-from kpc.tools.bench import harness, pacing, playback_stability, player_bench, streaming_bench, web_bench
+from kpc.tools.bench import harness, pacing, playback_stability, player_bench, streaming_bench, web_bench, web_loading
 from kpc.tools.bench.harness import size_text
 from kpc.tools.bench.records import Record
 
@@ -84,6 +84,13 @@ def add_parsers(kinds: Any) -> None:
         metavar="WxH",
         help="sizes of a picture; the software driver is timed at the first (default: 320x240 1280x720 1920x1080)",
     )
+    web.add_argument(
+        "--loading",
+        action="store_true",
+        help="measure instead how soon a page shows each scene over a line of 10 Mbit/s and 40 ms, beside a player of "
+        "splats that shows a still scene of as many bytes",
+    )
+    harness.add_repeats((web,))
     web.set_defaults(measure=_web)
 
 
@@ -150,7 +157,10 @@ def _steady(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
 
 
 def _web(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
-    """Yield a record for each scene, size, and level or what `auto` makes of one."""
+    """Yield a record for each scene, size, and level or what `auto` makes of one; with --loading, for each player."""
+    if options.loading:
+        yield from _web_loading(options, origin)
+        return
     for source in options.scenes:
         for number, size in enumerate(options.size):
             record = harness.new_record("web", source, origin, {})
@@ -159,6 +169,18 @@ def _web(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
             for (level, scale), measured in found.items():
                 settings = {"quality": level, "scale": scale, "size": size_text(size), "devices": web_bench.DEVICES}
                 yield record | {"seed": None, "renderer": renderer, "settings": settings, "repeats": [measured]}
+
+
+def _web_loading(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
+    """Yield a record for each scene and player."""
+    for source in options.scenes:
+        record = harness.new_record("webload", source, origin, {})
+        print(f"kpbench: {record['name']}, loading", file=sys.stderr)
+        repeats = [web_loading.measure(source) for _ in range(options.repeats)]
+        for player, first in repeats[0].items():
+            settings = {"player": player, "size": size_text(web_loading.SIZE), "shows": first["shows"]}
+            measured = [{key: value for key, value in found[player].items() if key != "shows"} for found in repeats]
+            yield record | {"seed": None, "renderer": "SwiftShader", "settings": settings, "repeats": measured}
 
 
 def _in_window(record: Record, repeats: int, measure: Callable[[Any], Record], job: object) -> Record:

@@ -14,6 +14,7 @@ import type {
   SceneHead,
 } from '../container/scene_chunks.js';
 import { parseSound, SOUND_LIMIT, type SoundSegment } from '../container/sound.js';
+import { emptyDistances } from '../render/atlas.js';
 import { loadDriver } from '../render/context.js';
 import type { Core } from './core.js';
 import { decodeSegment, type Projection } from './segment.js';
@@ -75,12 +76,19 @@ export interface SoundTask {
   total: number;
 }
 
+/** Find how far the cells [z][y][x] of an occupancy grid are from occupied ones. */
+export interface DistancesTask {
+  kind: 'distances';
+  occupied: Uint8Array;
+  sizes: readonly number[];
+}
+
 /** Load the driver of the graphics card. */
 export interface DriverTask {
   kind: 'driver';
 }
 
-export type Task = SceneTask | MetadataTask | ProjectTask | SegmentTask | SoundTask | DriverTask;
+export type Task = SceneTask | MetadataTask | ProjectTask | SegmentTask | SoundTask | DistancesTask | DriverTask;
 export type Result<T extends Task> = T extends SceneTask
   ? SceneContent
   : T extends MetadataTask
@@ -89,9 +97,11 @@ export type Result<T extends Task> = T extends SceneTask
       ? Projection
       : T extends SoundTask
         ? SoundSegment
-        : T extends DriverTask
-          ? undefined
-          : Int8Array<ArrayBuffer> | Uint16Array<ArrayBuffer>;
+        : T extends DistancesTask
+          ? Uint8Array<ArrayBuffer>
+          : T extends DriverTask
+            ? undefined
+            : Int8Array<ArrayBuffer> | Uint16Array<ArrayBuffer>;
 
 /** Do a task; return its result, and the buffers of it that are moved to the page instead of being copied. */
 export function perform(core: Core, task: Task): { result: Result<Task>; moved: ArrayBuffer[] } {
@@ -105,6 +115,10 @@ export function perform(core: Core, task: Task): { result: Result<Task>; moved: 
     case 'sound': {
       const content = new Chunk(task.number, task.entry, task.body).content(SOUND_LIMIT);
       return { result: parseSound(content, task.entry.rowCount, task.total), moved: [] };
+    }
+    case 'distances': {
+      const result = emptyDistances(task.occupied, task.sizes);
+      return { result, moved: [result.buffer] };
     }
     case 'driver':
       loadDriver();

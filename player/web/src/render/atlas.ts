@@ -143,7 +143,7 @@ export function displacementsAt({ sizes, displacements }: MotionGrid, time: numb
  * Two passes over the grid, one from each end, are exact: a shortest way never turns back (A. Rosenfeld and J. Pfaltz,
  * Distance functions on digital pictures, Pattern Recognition 1, 1968).
  */
-export function emptyDistances(occupied: Uint8Array, sizes: readonly number[]): Uint8Array {
+export function emptyDistances(occupied: Uint8Array, sizes: readonly number[]): Uint8Array<ArrayBuffer> {
   const [depth, height, width] = sizes;
   // With a border of cells that are far from everything, so that each cell has all its neighbours.
   const row = width + 2;

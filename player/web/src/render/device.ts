@@ -71,8 +71,8 @@ export class Device {
   readonly planeFormat: 'rgba16f' | 'rgba32f';
   #objects = 0;
   readonly #vertices: WebGLVertexArrayObject;
-  /** Whether a program has been taken in this frame: each waits a little for the card. */
-  hasTaken = false;
+  /** Until when programs may be taken in this frame: each waits a little for the card. */
+  takesUntil = 0;
   readonly #compiling = new Set<Compilation>();
   readonly #parallel: KHR_parallel_shader_compile | null;
 

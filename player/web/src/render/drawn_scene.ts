@@ -21,7 +21,7 @@ export interface Shot {
 }
 
 /** Texels that are uploaded at once, and before a frame at most: a hundredth of a second on a slow telephone. */
-const [BYTES_AT_ONCE, BYTES_A_FRAME] = [1 << 18, 4 << 20];
+const [BYTES_AT_ONCE, BYTES_A_FRAME] = [1 << 16, 4 << 20];
 /** Milliseconds of a frame after which the rest of the texels waits for the next one. */
 const UPLOAD_MS = 6;
 

@@ -70,6 +70,8 @@ const ASSUMED_SECONDS = { card: 2e-7, processor: 1e-5 };
 const FPS = { card: 30, processor: 10 };
 /** Rays for a pixel of the first pictures on a card, before it is known how fast it is. */
 export const FIRST_RAYS = 0.1;
+/** Milliseconds of a frame after which programs that are compiled wait for the next one. */
+const TAKING_MS = 4;
 /** How fast what is known of it follows what is measured. */
 const NEW_WEIGHT = 0.5;
 const LIVE = ['live', 'other live'];
@@ -299,7 +301,7 @@ export class Renderer {
 
   /** Whether no compiler keeps a picture waiting. */
   #isReady({ moments, part }: View, setting: Setting, merging: Merging | null = null): boolean {
-    this.#device.hasTaken = false;
+    this.#device.takesUntil = performance.now() + TAKING_MS;
     const parts = { all: [true], static: [false], dynamic: [true, false] }[part];
     const areReady = moments.flatMap(({ scene }) =>
       parts.map((isMoving) => scene.isReady(this.#device, LEVELS[setting.level], isMoving, merging !== null)),

@@ -40,6 +40,11 @@ export interface SceneSource {
   take(bytes: number): Iterable<PlaneRows>;
   /** Return a time plane at a time in [0, 1]: [column][channel], 1 where it has not arrived. */
   row(scale: number, plane: TimePlane, time: number): Float32Array;
+  /**
+   * Return the distances of the cells [z][y][x] of a slot of the occupancy grid to occupied ones, 255 at most; null as
+   * long as they are not known, when `version` will grow.
+   */
+  distances(slot: number): Uint8Array | null;
   /** Hand out all rows once more. */
   restore(): void;
 }
@@ -56,8 +61,15 @@ export function extentOf({ head: { aabb } }: SceneSource): number {
   return Math.max(aabb[3] - aabb[0], aabb[4] - aabb[1], aabb[5] - aabb[2]);
 }
 
+/** Return which cells [z][y][x] are occupied in a slot of the occupancy grid. */
+export function occupiedIn({ occupancy }: Pick<SceneSource, 'occupancy'>, slot: number): Uint8Array {
+  const [, depth, height, width] = occupancy.sizes;
+  const cells = depth * height * width;
+  return occupancy.occupied.subarray(slot * cells, (slot + 1) * cells);
+}
+
 /** Return the slot of the occupancy grid that holds at a time in [0, 1]. */
-export function occupancySlot({ occupancy }: SceneSource, time: number): number {
+export function occupancySlot({ occupancy }: Pick<SceneSource, 'occupancy'>, time: number): number {
   const [slots] = occupancy.sizes;
   return Math.min(Math.floor(time * slots), slots - 1);
 }

@@ -1,11 +1,11 @@
 /** The textures of a scene, and the programs that read them. */
 
-import { displacementsAt, emptyDistances, Layout, rowWidth, timeRows } from './atlas.js';
+import { displacementsAt, Layout, rowWidth, timeRows } from './atlas.js';
 import { columnsOf } from './camera.js';
 import { CompiledPrograms } from './compiled.js';
 import { RenderError } from './context.js';
 import { bytesOf, type Compilation, type Device, type Program, type Texture } from './device.js';
-import { occupancySlot, type PlaneRows, type SceneSource, type SpacePlane } from './scene_source.js';
+import { occupancySlot, occupiedIn, type PlaneRows, type SceneSource, type SpacePlane } from './scene_source.js';
 import { constants, type Defines } from './shader.js';
 import { blockArrays, decoderArrays, decoderShape, planesShape } from './shader_constants.js';
 
@@ -32,8 +32,8 @@ export class SceneTextures {
   readonly rows: Texture;
   readonly cells: Texture;
   readonly motion: Texture | null = null;
-  readonly #distances = new Map<number, Uint8Array>();
-  #slot = -1;
+  /** The slot whose cells are there, and whether with their distances. */
+  #slot = '';
   /** Time and version of the rows. */
   #rows = '';
   #motionTime = Number.NaN;
@@ -73,14 +73,12 @@ export class SceneTextures {
 
   setOccupancy(time: number): void {
     const slot = occupancySlot(this.scene, time);
-    if (slot === this.#slot) return;
-    const { sizes, occupied } = this.scene.occupancy;
-    const cells = sizes[1] * sizes[2] * sizes[3];
-    const found = this.#distances.get(slot);
-    const distances = found ?? emptyDistances(occupied.subarray(slot * cells, (slot + 1) * cells), sizes.slice(1));
-    this.#distances.set(slot, distances);
-    this.device.write(this.cells, distances);
-    this.#slot = slot;
+    const distances = this.scene.distances(slot);
+    const key = `${slot} ${distances !== null}`;
+    if (key === this.#slot) return;
+    // Until distances are known, empty cells count as next to occupied ones: rays take more steps.
+    this.device.write(this.cells, distances ?? occupiedIn(this.scene, slot).map((isOccupied) => 1 - isOccupied));
+    this.#slot = key;
   }
 
   /** Bind all textures to their units, `planes` being the scene's or planes that rows are folded into. */

@@ -13,6 +13,8 @@ import type { DecoderPool } from '../decoder/pool.js';
 import { needsOccupancy, type Projection } from '../decoder/segment.js';
 import type { SceneContent } from '../decoder/tasks.js';
 import { layerCount } from '../decoder/texels.js';
+import { occupancySlot } from '../render/scene_source.js';
+import { CellDistances } from './cell_distances.js';
 import { adjacentRuns, isThere, openContainer, readContent } from './opening.js';
 import {
   fetchOrder,
@@ -94,6 +96,7 @@ export class SceneStream {
   readonly #exceedsMemory: boolean;
   readonly #timePlanes: Scale<TimePlane>[];
   readonly #projections = new Map<PlaneName, Promise<Projection>>();
+  readonly #distances: CellDistances;
   readonly #requests = new Set<Request>();
   #keep: boolean[];
   #head: Playhead = { time: 0, rate: 0, loop: true };
@@ -121,6 +124,11 @@ export class SceneStream {
       throw new BudgetError(`${source.name}: playing takes ${fixed + least} bytes, more than the budget of ${memory}`);
     }
     this.#segmentMemory = memory - fixed;
+    this.#distances = new CellDistances(content, pool, (error) => {
+      if (error) return this.#fail(error);
+      this.version++;
+      this.#changed();
+    });
     const fitting = segmentsToKeep(this.#segments, this.#head, this.#segmentMemory);
     this.#exceedsMemory = fitting.includes(false);
     this.#keep = fitting.map((fits, position) => fits && !this.#isMissing[position]);
@@ -175,6 +183,7 @@ export class SceneStream {
   /** Set the position in the scene. A jump cancels requests that the picture does not wait for. */
   setPlayhead(head: Playhead): void {
     this.#head = head;
+    this.distances(occupancySlot(this, head.time)); // before there are planes for workers to decode
     if (this.#exceedsMemory) {
       const fitting = segmentsToKeep(this.#segments, head, this.#segmentMemory);
       this.#keep = fitting.map((fits, position) => fits && !this.#isMissing[position]);
@@ -232,6 +241,11 @@ export class SceneStream {
     return found.sample(time, out);
   }
 
+  /** Return the distances of a slot's cells to occupied ones, or null while a worker finds them. */
+  distances(slot: number): Uint8Array | null {
+    return this.#distances.of(slot);
+  }
+
   /** Hand out all space planes again: the renderer has lost them. */
   restore(): void {
     for (const piece of this.#pieces) piece.takenRows = 0;
@@ -268,7 +282,9 @@ export class SceneStream {
 
   /** Whether everything that fits the memory is held, or nothing more will come. */
   get isSettled(): boolean {
-    return this.error !== null || this.#keep.every((keep, position) => !keep || this.#state[position] === State.Held);
+    if (this.error !== null) return true;
+    const isHeld = this.#keep.every((keep, position) => !keep || this.#state[position] === State.Held);
+    return isHeld && !this.#distances.arePending;
   }
 
   /** Whether the file ends before the scene does. */
@@ -316,7 +332,7 @@ export class SceneStream {
     const { head, occupancy, motion } = this.#content;
     const largest = Math.max(...this.#segments.map(({ number }) => this.#texelBytes(number)));
     const stored = Math.max(...this.#container.index.map((entry) => (entry.kind === 'PLNE' ? entry.storedLength : 0)));
-    const cells = occupancy.occupied.length + occupancy.content.length + occupancy.occupied.length / occupancy.sizes[0];
+    const cells = occupancy.occupied.length * (2 + 1 / occupancy.sizes[0]) + occupancy.content.length;
     const grid = motion ? 4 * motion.displacements.length * (1 + 4 / 3 / motion.sizes[0]) : 0;
     return (
       textureBytes(head) + cells + grid + this.sound.memoryBytes + WAITING_BYTES + largest + 2 * (RUN_BYTES + stored)

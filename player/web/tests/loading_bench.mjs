@@ -1,0 +1,126 @@
+/**
+ * Times pages over a slow line: `node loading_bench.mjs CHROMIUM FOLDER SECONDS PAGE ...`, each in a browser of its own.
+ *
+ * A page calls `firstPicture()` once it shows something. Writes a list as JSON: milliseconds from navigation to that,
+ * the longest task of the page's main thread until then, by the clock and by its processor time, bytes fetched, and
+ * frames a second that are drawn on the canvas in the SECONDS after that.
+ */
+
+import { readFileSync } from 'node:fs';
+import { createServer } from 'node:http';
+import { extname, join } from 'node:path';
+import { gzipSync } from 'node:zlib';
+import { chromium } from 'playwright-core';
+import { FLAGS } from './browser_flags.mjs';
+
+/** A line of 10 Mbit/s, and milliseconds until answers begin. */
+const LINE = { offline: false, latency: 40, downloadThroughput: 1.25e6, uploadThroughput: 1.25e6 };
+const TYPES = { '.html': 'text/html', '.js': 'text/javascript' };
+const [executablePath, folder, seconds, ...pages] = process.argv.slice(2);
+
+/** In the page: note the first picture, and the frames in which something is drawn on a canvas. */
+function watch() {
+  globalThis.found = { first: 0, frames: [] };
+  globalThis.firstPicture = () => {
+    globalThis.found.first ||= performance.now();
+    performance.mark('first picture');
+  };
+  const { prototype } = WebGL2RenderingContext;
+  let isOnCanvas = true;
+  const { bindFramebuffer } = prototype;
+  prototype.bindFramebuffer = function (target, framebuffer) {
+    isOnCanvas = framebuffer === null;
+    bindFramebuffer.call(this, target, framebuffer);
+  };
+  let last = 0;
+  for (const name of ['drawArrays', 'drawElements', 'drawArraysInstanced', 'drawElementsInstanced']) {
+    const draw = prototype[name];
+    prototype[name] = function (...args) {
+      draw.apply(this, args);
+      const now = document.timeline.currentTime;
+      if (isOnCanvas && now !== last) globalThis.found.frames.push(now);
+      last = isOnCanvas ? now : last;
+    };
+  }
+}
+
+function serve() {
+  const packed = new Map();
+  const server = createServer((request, response) => {
+    const name = new URL(request.url, 'http://localhost').pathname.slice(1);
+    const type = TYPES[extname(name)] ?? 'application/octet-stream';
+    let bytes;
+    try {
+      bytes = readFileSync(join(folder, name));
+    } catch {
+      return response.writeHead(404).end();
+    }
+    if (type !== 'application/octet-stream') {
+      if (!packed.has(name)) packed.set(name, gzipSync(bytes));
+      return response.writeHead(200, { 'content-type': type, 'content-encoding': 'gzip' }).end(packed.get(name));
+    }
+    const asked = /^bytes=(\d+)-(\d+)$/.exec(request.headers.range ?? '');
+    const headers = { 'content-type': type, etag: '"1"' };
+    if (!asked) return response.writeHead(200, headers).end(bytes);
+    const [first, end] = [Number(asked[1]), Math.min(Number(asked[2]) + 1, bytes.length)];
+    response.writeHead(206, { ...headers, 'content-range': `bytes ${first}-${end - 1}/${bytes.length}` });
+    response.end(bytes.subarray(first, end));
+  });
+  return new Promise((resolve) => server.listen(0, '127.0.0.1', () => resolve(server)));
+}
+
+/** Return the longest task of the page's main thread between navigation and its first picture, in milliseconds. */
+function longestTask(events) {
+  const main = events.find(({ name, args }) => name === 'thread_name' && args.name === 'CrRendererMain' && args);
+  const mark = events.find(({ name }) => name === 'first picture');
+  const thread = mark ?? main;
+  const start = Math.max(
+    ...events.filter(({ name, pid }) => name === 'navigationStart' && pid === thread.pid).map(({ ts }) => ts),
+  );
+  const tasks = events.filter(
+    ({ name, pid, tid, ts }) =>
+      name.endsWith('RunTask') && pid === thread.pid && tid === thread.tid && ts >= start && ts <= mark.ts,
+  );
+  return {
+    longest_task_ms: Math.max(...tasks.map(({ dur = 0 }) => dur)) / 1e3,
+    longest_task_cpu_ms: Math.max(...tasks.map(({ tdur = 0 }) => tdur)) / 1e3,
+  };
+}
+
+async function measure(address, name) {
+  const browser = await chromium.launch({ executablePath, args: FLAGS });
+  try {
+    const page = await browser.newPage({ viewport: { width: 320, height: 240 } });
+    page.on('pageerror', (error) => console.error(`${name}: ${error.message}`));
+    await page.addInitScript(watch);
+    await page.goto('about:blank');
+    const client = await page.context().newCDPSession(page);
+    await client.send('Network.enable');
+    await client.send('Network.emulateNetworkConditions', LINE);
+    let bytes = 0;
+    client.on('Network.loadingFinished', ({ encodedDataLength }) => {
+      bytes += encodedDataLength;
+    });
+    await browser.startTracing(page, { categories: ['toplevel', 'blink.user_timing', 'disabled-by-default-v8.gc'] });
+    await page.goto(`${address}/${name}`);
+    await page.waitForFunction(() => globalThis.found.first > 0, null, { timeout: 60_000 });
+    const { traceEvents } = JSON.parse((await browser.stopTracing()).toString());
+    const from = await page.evaluate(() => document.timeline.currentTime);
+    await page.waitForTimeout(1000 * seconds);
+    if (process.env.KPC_SCREENSHOTS) await page.screenshot({ path: join(process.env.KPC_SCREENSHOTS, `${name}.png`) });
+    const { first, frames } = await page.evaluate(() => globalThis.found);
+    const drawn = frames.filter((at) => at >= from && at < from + 1000 * seconds).length;
+    return { first_picture_ms: first, ...longestTask(traceEvents), bytes, fps: drawn / seconds };
+  } finally {
+    await browser.close();
+  }
+}
+
+const server = await serve();
+try {
+  const results = [];
+  for (const name of pages) results.push(await measure(`http://127.0.0.1:${server.address().port}`, name));
+  process.stdout.write(JSON.stringify(results));
+} finally {
+  server.close();
+}
