@@ -112,6 +112,22 @@ async function hasAll(clip: Clip, expected: Scene): Promise<void> {
   }
 }
 
+test('fetches a coarse picture and no more as long as that is all that is wanted', async () => {
+  await withServer(LONG, {}, async (server) => {
+    await withClip(server.url, { position: null }, async (clip) => {
+      const [stream] = clip.scenes;
+      clip.setPlayhead({ time: 50, isPreview: true });
+      await until(clip, () => stream.completeScales === 1 && clip.canShow(50));
+      const { length } = server.requests;
+      await new Promise((resolve) => setTimeout(resolve, 30));
+      assert.deepEqual([server.requests.length, stream.completeScales, clip.isSettled], [length, 1, false]);
+      assert.ok(clip.receivedBytes < LONG.length / 4);
+      clip.setPlayhead({ time: 50 });
+      await until(clip, () => clip.isSettled);
+    });
+  });
+});
+
 test('plays the sample from memory and from a server', async () => {
   const expected = new Scene(SAMPLE, core);
   await withClip(SAMPLE.buffer.slice(0), {}, (clip) => hasAll(clip, expected));

@@ -588,12 +588,24 @@ scenario('shows the poster and loads nothing before it is asked to', async () =>
   await close(page);
 });
 
-scenario('reads the header alone with preload="metadata"', async () => {
-  const page = await open(TAG.replace('muted', 'muted preload="metadata"').replace('scene', 'slow/long'));
-  await until(page, (it) => it.readyState === 1);
+scenario('shows a coarse picture or the poster with preload="metadata"', async () => {
+  const tag = TAG.replace('muted', 'muted preload="metadata"').replace('scene.kpc', 'long.kpc');
+  const page = await open(tag + tag.replace('muted', 'muted poster="poster.png"'));
+  await shown(page);
+  const other = await page.evaluate(async () => {
+    const [, it] = document.querySelectorAll('kpc-player');
+    await new Promise((resolve) => setTimeout(resolve, 300));
+    return { readyState: it.readyState, hasPoster: it.shadowRoot.querySelector('.poster').checkVisibility() };
+  });
+  assert.deepEqual(other, { readyState: 1, hasPoster: true });
   assert.ok((await player(page, (it) => it.duration)) > 7);
   assert.equal(await inside(page, '.large').isVisible(), true);
+  const read = () =>
+    page.evaluate(() => performance.getEntriesByType('resource').filter(({ name }) => /kpc$/.test(name)));
+  const before = (await read()).length;
   await player(page, (it) => it.play());
+  await until(page, (it) => it.readyState >= 3 && it.currentTime > 0);
+  assert.ok((await read()).length > before);
   await close(page);
 });
 

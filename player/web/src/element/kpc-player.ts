@@ -328,6 +328,7 @@ export class KpcPlayer extends AudibleElement implements Model {
       {
         ...{ src, memory: this.memory, fps: this.targetFps || undefined, clock: this.#clock, stage: this.#ui.stage },
         workerUrl: this.getAttribute('worker-url'),
+        hasPoster: () => this.poster !== '',
         volume: () => this.loudness,
         shown: () => ({ level: this.quality, part: this.shownPart, appearance: this.appearance }),
       },

@@ -24,6 +24,7 @@ export interface SessionOptions {
   workerUrl: string | null;
   fps: number | undefined;
   clock: Clock;
+  hasPoster(): boolean;
   /** Of the sound, 0 to 1; 0 while it is off. */
   volume(): number;
   /** Where the picture goes. */
@@ -52,7 +53,7 @@ export class Session {
   isShown = false;
   /** Pictures that have been shown so far. */
   pictures = 0;
-  /** Whether what is fetched follows the playhead; false waits after the header. */
+  /** Whether what is fetched follows the playhead; false fetches the header and, without a poster, a coarse picture. */
   fetches = true;
   clip: Clip | null = null;
   view: ViewControl | null = null;
@@ -89,7 +90,8 @@ export class Session {
     try {
       const pool = workerUrl === null ? {} : { workerUrl };
       const driver = loadDriver(pool);
-      const clip = await Clip.open(src, { memory, signal: this.#opening.signal, pool });
+      const position = this.fetches ? { time: 0 } : null;
+      const clip = await Clip.open(src, { memory, signal: this.#opening.signal, pool, position });
       if (this.#isClosed) return clip.close();
       this.clip = clip;
       this.sound = new SessionSound(clip, clock, volume, (message) => this.#events.told(message));
@@ -261,10 +263,12 @@ export class Session {
 
   /** Let time pass. */
   #advance(clip: Clip, seconds: number): void {
-    const { clock } = this.#options;
-    if (this.fetches) clip.setPlayhead({ time: clock.time, rate: clock.speed, loop: clock.loop });
+    const { clock, hasPoster } = this.#options;
+    const isPreview = !this.fetches;
+    if (!isPreview || !hasPoster())
+      clip.setPlayhead({ time: clock.time, rate: clock.speed, loop: clock.loop, isPreview });
     clock.tick(this.sound?.advance(seconds) ?? seconds, (time) => this.isShown && clip.canShow(time));
-    if (this.isShown) this.sound?.follow(); // a listener may have ended all this
+    if (this.isShown && this.fetches) this.sound?.follow(); // a listener may have ended all this
   }
 
   #draw(): void {

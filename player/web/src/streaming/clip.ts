@@ -40,6 +40,8 @@ export interface ClipPosition {
   time: number;
   rate?: number;
   loop?: boolean;
+  /** Whether a coarse picture at that time is all that is wanted. */
+  isPreview?: boolean;
 }
 
 /** A scene in the picture, its own time in [0, 1], and its share of colour and opacity. */
@@ -189,10 +191,10 @@ export class Clip extends EventTarget {
   }
 
   /** Set the position: what is fetched, shown and released follows from it. */
-  setPlayhead({ time, rate = 0, loop = true }: ClipPosition): void {
+  setPlayhead({ time, rate = 0, loop = true, isPreview = false }: ClipPosition): void {
     if (this.#isClosed) return;
     const share = this.#shareAt(time);
-    this.#position = { time: share, rate: this.duration > 0 ? rate / this.duration : 0, loop };
+    this.#position = { time: share, rate: this.duration > 0 ? rate / this.duration : 0, loop, isPreview };
     const { group } = this.timeline.at(share);
     if (this.#next?.group === group && this.#canSwitchTo(this.#next)) this.#switch();
     const blended = this.timeline.blendAt(share).find((part) => part.group !== this.#shown.group)?.group;
@@ -200,7 +202,7 @@ export class Clip extends EventTarget {
     const wanted = isWaiting ? group : (blended ?? this.#groupAfter());
     if (this.#next && this.#next.group !== wanted) this.#release();
     if (this.#opening && this.#opening.group !== wanted) this.#opening.control.abort();
-    const isUrgent = isWaiting || blended !== undefined || this.#isNearEnd();
+    const isUrgent = isWaiting || blended !== undefined || (!isPreview && this.#isNearEnd());
     if (wanted !== undefined && !this.#next && (isUrgent || this.#shown.isSettled)) this.#begin(wanted);
     for (const scene of this.scenes) scene.setPlayhead(this.#headIn(scene.group));
   }
@@ -348,11 +350,11 @@ export class Clip extends EventTarget {
   }
 
   #headIn(group: number): Playhead {
-    const { time, rate, loop } = this.#position;
+    const { time, rate, loop, isPreview } = this.#position;
     const { first, last } = this.timeline.spans[group];
     const localRate = (rate * Math.max(this.frameCount - 1, 1)) / Math.max(last - first, 1);
     const isSingle = this.timeline.spans.length === 1;
-    return { time: this.timeline.localTime(group, time), rate: localRate, loop: loop && isSingle };
+    return { time: this.timeline.localTime(group, time), rate: localRate, loop: loop && isSingle, isPreview };
   }
 
   #release(): void {

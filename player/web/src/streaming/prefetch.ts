@@ -25,6 +25,8 @@ export interface Playhead {
   rate: number;
   /** Whether the clip begins again after its end. */
   loop: boolean;
+  /** Whether a coarse picture at that time is all that is wanted. */
+  isPreview?: boolean;
 }
 
 /** A segment of a plane, and the times between which it is needed. */
@@ -60,6 +62,10 @@ export function segmentsOf(index: readonly Entry[], head: SceneHead): Segment[] 
 /** Whether times from `start` to `end` need a segment. */
 export const isNeeded = (segment: Segment, start: number, end: number): boolean =>
   segment.since < end && start < segment.until;
+
+/** Whether the playhead wants a segment at all. */
+export const isWanted = (segment: Segment, { time, isPreview }: Playhead): boolean =>
+  !isPreview || (segment.scale === 0 && isNeeded(segment, time, time));
 
 /** Return how far ahead of the playhead a segment is needed, as a share of the clip; 0 if it is needed now. */
 export function distanceAhead(segment: Segment, { time, loop }: Playhead): number {

@@ -19,6 +19,7 @@ import { adjacentRuns, isThere, openContainer, readContent } from './opening.js'
 import {
   fetchOrder,
   isNeeded,
+  isWanted,
   minSegmentBytes,
   type Playhead,
   type Segment,
@@ -390,9 +391,10 @@ export class SceneStream {
     if (!this.#keep.some((keep, position) => keep && this.#state[position] === State.Wanted)) return [];
     const wanted = fetchOrder(this.#segments, this.#head, this.completeScales)
       .filter((position) => this.#keep[position] && this.#state[position] === State.Wanted)
+      .filter((position) => isWanted(this.#segments[position], this.#head))
       .slice(0, RUN_CHUNKS);
     const positions = new Map(wanted.map((position) => [this.#segments[position].number, position]));
-    const [run] = adjacentRuns(this.#container.index, [...positions.keys()], RUN_BYTES);
+    const [run = []] = adjacentRuns(this.#container.index, [...positions.keys()], RUN_BYTES);
     let [texels, symbols] = [0, 0];
     for (const [position, { isTime, number, bytes }] of this.#segments.entries()) {
       if (isTime && this.#state[position] !== State.Wanted) symbols += bytes;
