@@ -20,8 +20,10 @@ export interface Shot {
   limits?: Limits | null; // how far rays see
 }
 
-/** Texels that are uploaded at once, and before a frame at most: a hundredth of a second on a slow telephone. */
-const [BYTES_AT_ONCE, BYTES_A_FRAME] = [1 << 16, 4 << 20];
+/** Bytes of texels that are uploaded at once: to a card, and to a processor, for which they are made float32 before. */
+const BYTES_AT_ONCE = { card: 1 << 18, processor: 1 << 16 };
+/** Bytes that are uploaded before a frame at most: a hundredth of a second on a slow telephone. */
+const BYTES_A_FRAME = 4 << 20;
 /** Milliseconds of a frame after which the rest of the texels waits for the next one. */
 const UPLOAD_MS = 6;
 
@@ -49,8 +51,9 @@ export class DrawnScene {
   upload(device: Device): void {
     const { textures, folded } = this.#on(device);
     const due = performance.now() + UPLOAD_MS;
-    for (let bytes = 0; bytes < BYTES_A_FRAME; bytes += BYTES_AT_ONCE) {
-      const taken = [...this.source.take(BYTES_AT_ONCE)];
+    const atOnce = device.isSoftware ? BYTES_AT_ONCE.processor : BYTES_AT_ONCE.card;
+    for (let bytes = 0; bytes < BYTES_A_FRAME; bytes += atOnce) {
+      const taken = [...this.source.take(atOnce)];
       for (const rows of taken) textures.put(rows);
       if (taken.length) folded?.planesChanged();
       if (taken.length === 0 || performance.now() > due) break;
