@@ -175,7 +175,7 @@ BAD_YAML: list[tuple[str, str, str, str]] = [
     ("extri.yml", "T_010:", "T_01:", "'T_01' is there twice"),
     ("extri.yml", "rows: 3", "rows: [", "not YAML"),
     ("extri.yml", "names", "\x00", "not YAML"),
-    ("intri.yml", "%YAML:1.0", "[" * 5000, "not YAML"),
+    ("intri.yml", "%YAML:1.0", "[" * 5000, "nested too deeply"),
     ("extri.yml", "", "- a list", "holds no cameras"),
     ("extri.yml", "", "# a very long comment\n" * 30000, "larger than 512 KiB"),
 ]

@@ -18,9 +18,12 @@ from kpc.encoder.datasets.capture import printable
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.text import open_text
 
-# The largest file of calibrations, in bytes, and the largest of YAML, of which PyYAML parses 40 KB a second at worst.
+# The largest file of calibrations, in bytes, and the largest of YAML, of which PyYAML parses 30 KB a second at worst.
 # Two hundred cameras take 60 to 100 KB.
 MAX_BYTES, MAX_YAML_BYTES = 2 << 20, 512 << 10
+
+# The most brackets of YAML inside each other, whose number each word costs. Calibrations have two.
+MOST_NESTED = 32
 
 # The first line that OpenCV writes is no directive of YAML.
 _OPENCV_DIRECTIVE = re.compile(r"\A%YAML:1\.[0-9]+[^\n]*\n")
@@ -45,6 +48,11 @@ def read_yaml(file: Path) -> Any:
     """
 
     def parse(text: str) -> Any:
+        depth = 0
+        for bracket in re.findall(r"[\[\]{}]", text):
+            depth += 1 if bracket in "[{" else -1
+            if depth > MOST_NESTED:
+                raise ValueError("brackets are nested too deeply")
         return yaml.load(_OPENCV_DIRECTIVE.sub("", text), _TextLoader)  # a BaseLoader makes nothing but texts
 
     return _parsed(file, "YAML", MAX_YAML_BYTES, parse)
