@@ -62,3 +62,18 @@ test('settings cost more and more', () => {
     assert.ok(costs.length >= 2 && costs[0] <= Math.max(0.01, (texels / 3) ** 2));
   }
 });
+
+test('slow frames at the beginning, or while something else runs, do not keep pictures coarse', () => {
+  const perRay = 0.047 / costOf(settingsOf(0.6)[0], 0.6);
+  const pace = new Pace(0.1, 0);
+  const play = (frames: number, factor: number): number[] =>
+    Array.from({ length: frames }, () => {
+      const cost = costOf(pace.setting(0.6), 0.6);
+      pace.record(cost, perRay * cost * factor);
+      return perRay * cost;
+    });
+  play(6, 6);
+  assert.ok((play(40, 1).at(-1) ?? 0) > 0.06);
+  play(12, 6);
+  assert.ok((play(120, 1).at(-1) ?? 0) > 0.06); // within twelve seconds
+});

@@ -47,8 +47,9 @@ const TOO_SLOW = 1.05;
 // Frames of one cost before a coarser or a finer one: slow frames disturb at once, a finer picture can wait.
 const DOWN_AFTER = 3;
 const UP_AFTER = 8;
-// Frames for which the time of other costs, and what proved too slow, is remembered.
+// Frames for which the time of other costs is remembered, and seconds for which that is which proved too slow.
 const REMEMBERED = 300;
+const AVOIDED_S = 10;
 // Share of the time of a frame below which the next finer setting is tried, whatever is expected of it, and its cost
 // over that of the one before.
 const ROOMY = 0.7;
@@ -76,6 +77,8 @@ export class Pace {
   #recent: number[] = [];
   #lastCost = 0;
   #frames = 0;
+  #elapsed = 0;
+  #coarsest = 0;
   readonly #times = new Map<number, { seconds: number; frame: number }>();
   #tooMuch = { cost: Number.POSITIVE_INFINITY, until: 0 };
 
@@ -88,6 +91,7 @@ export class Pace {
   /** Return the finest setting for which there is time. */
   setting(texelsPerPixel: number): Setting {
     const [fastest, ...finer] = settingsOf(texelsPerPixel);
+    this.#coarsest = costOf(fastest, texelsPerPixel);
     return finer.reduce(
       (best, setting) => (this.#isAffordable(costOf(setting, texelsPerPixel)) ? setting : best),
       fastest,
@@ -97,6 +101,7 @@ export class Pace {
   /** Take the time of a picture, and how many rays were marched for each of its pixels. */
   record(cost: number, seconds: number): void {
     this.#frames++;
+    this.#elapsed += Math.max(seconds, this.secondsPerFrame);
     if (cost !== this.#lastCost) this.#recent = [];
     this.#lastCost = cost;
     this.#recent.push(seconds);
@@ -110,13 +115,15 @@ export class Pace {
     const [spare, least] = [IN_TIME * this.secondsPerFrame - fixed, fixed / 2];
     const affordable = Math.max(spare, least) / perRay;
     if (least > spare) this.#tooMuch.until = 0;
-    else if (isTooSlow && affordable < cost) this.#tooMuch = { cost, until: this.#frames + REMEMBERED };
+    else if (isTooSlow && affordable < cost && cost > this.#coarsest) {
+      this.#tooMuch = { cost, until: this.#elapsed + AVOIDED_S };
+    }
     const isRoomy = lately < ROOMY * this.secondsPerFrame;
     this.#affordable = isTooSlow ? affordable : Math.max(affordable, isRoomy ? NEXT_COST * cost : cost);
   }
 
   #isAffordable(cost: number): boolean {
-    const isTooMuch = cost >= this.#tooMuch.cost && this.#frames < this.#tooMuch.until;
+    const isTooMuch = cost >= this.#tooMuch.cost && this.#elapsed < this.#tooMuch.until;
     return cost <= this.#affordable && !isTooMuch;
   }
 
