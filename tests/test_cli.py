@@ -4,6 +4,7 @@ import errno
 import importlib
 import importlib.metadata
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -48,6 +49,30 @@ def test_errors_that_users_can_fix_are_one_line(
 def test_bugs_keep_their_traceback(error: Exception, cause: Exception | None) -> None:
     with pytest.raises(type(error)):
         cli.run(raising(error, cause), "kpx", [])
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_is_reported_with_the_file_that_was_to_be_written(tmp_path: Path, number: int) -> None:
+    with pytest.raises(OSError) as caught, cli.atomic_write(tmp_path / "film.mp4") as aside:
+        aside.write_bytes(b"half")
+        raise OSError(number, "full")
+    assert (caught.value.errno, caught.value.filename) == (number, str(tmp_path / "film.mp4"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_errors_name_the_file_that_was_asked_for_not_the_one_written_aside(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as caught, cli.atomic_write(tmp_path / "none" / "a.png"):
+        pass
+    assert caught.value.filename == str(tmp_path / "none" / "a.png")
+    with pytest.raises(FileNotFoundError) as caught, cli.atomic_write(tmp_path / "a.png") as aside:
+        aside.unlink()
+    assert caught.value.filename == str(tmp_path / "a.png")
+
+
+def test_errors_of_other_files_stay_as_they_are_while_one_is_written(tmp_path: Path) -> None:
+    with pytest.raises(PermissionError) as caught, cli.atomic_write(tmp_path / "a.png"):
+        raise PermissionError(errno.EACCES, "no", "b.png")
+    assert caught.value.filename == "b.png"
 
 
 @pytest.mark.parametrize("module", ["encoder.cli.kpenc", "tools.cli.kpedit", "tools.cli.kpjoin"])

@@ -134,7 +134,7 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
         help="folder with videos or images, and poses_bounds.npy, transforms*.json or sparse/0; "
         "or a finished checkpoint, or a .kpc file",
     )
-    parser.add_argument("-o", "--output", type=Path, help="the .kpc file to write")
+    parser.add_argument("-o", "--output", type=cli.named_path, help="the .kpc file to write")
     _add_training_options(parser)
     _add_dataset_options(parser)
     _add_sound_options(parser)
@@ -239,7 +239,9 @@ def _add_sound_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_run_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--work", type=Path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)")
+    parser.add_argument(
+        "--work", type=cli.named_path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)"
+    )
     parser.add_argument("--keep", action="store_true", help="keep that folder when done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
     parser.add_argument(
@@ -256,7 +258,7 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--keep-checkpoint",
-        type=Path,
+        type=cli.named_path,
         metavar="MODEL.kpck",
         help="also write the finished checkpoint there; kpenc codes it anew without training",
     )

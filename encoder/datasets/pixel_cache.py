@@ -1,6 +1,5 @@
 """A cache of decoded pictures, or of masks: one flat file on disk that later runs reuse."""
 
-import errno
 import hashlib
 import json
 import mmap
@@ -16,7 +15,7 @@ from typing import Any
 import google_crc32c
 import numpy as np
 
-from kpc.format.common.cli import atomic_write
+from kpc.format.common.cli import NO_ROOM, atomic_write
 from kpc.format.common.errors import DatasetError
 
 # Part of every fingerprint: caches of another version are rebuilt.
@@ -178,7 +177,7 @@ def build_cache(
         with atomic_write(path.with_suffix(".json")) as temporary:
             temporary.write_text(json.dumps(description))
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if error.errno in NO_ROOM:
             raise DatasetError(disk_full) from error
         raise
     return PixelCache(path, tuple(tiles), channels, shown)

@@ -23,6 +23,9 @@ from kpc.format.common.version import VERSION
 # Packages that only some extras bring, with one that does.
 EXTRAS = {"numba": "cpu", "llvmlite": "cpu", "OpenEXR": "film"}
 
+# Errors of writing where no space is left, or none that the user may take.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+
 # Seconds by which a time that was typed may be beyond an end and still mean it: durations are shown in hundredths.
 TIME_SLACK_S = 0.0051
 
@@ -74,7 +77,7 @@ def message_of(error: KpcError | OSError) -> str | None:
     """Return what to tell the user about an error; None if it is a bug: an OSError without a file or a full disk."""
     if isinstance(error, KpcError):
         return str(error)
-    if error.filename is None and error.errno != errno.ENOSPC:
+    if error.filename is None and error.errno not in NO_ROOM:
         return None
     where = f"{error.filename}: " if error.filename is not None else ""
     return f"{where}{error.strerror or error}"
@@ -109,22 +112,32 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     A reader of `path` therefore never sees a half-written file. The temporary file keeps the suffix, since writers of
     images and videos choose the file format by it.
+
+    Raises:
+        OSError: the file cannot be written; the error names `path`.
     """
     target = Path(path)
     if target.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
-    handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
-    os.close(handle)
-    temporary = Path(name)
+    temporary: Path | None = None
     try:
+        handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
+        os.close(handle)
+        temporary = Path(name)
         yield temporary
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)  # mkstemp created it readable by its owner alone
         os.replace(temporary, target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except OSError as error:
+        # Errors of writing name no file, all others the temporary one.
+        is_of_target = temporary is None or error.filename == str(temporary)
+        if is_of_target or (error.filename is None and error.errno in NO_ROOM):
+            raise OSError(error.errno, error.strerror, str(target)) from error
         raise
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)  # unless it has been renamed
 
 
 def make_folder(path: Path) -> None:
@@ -142,7 +155,19 @@ def input_path(text: str) -> Path:
     """Parse the path of a file or folder to read; refuse addresses, which as paths would lose a slash."""
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", text):
         raise argparse.ArgumentTypeError("an address cannot be given here; download the file and give its path")
-    return Path(text)
+    return named_path(text)
+
+
+def file_name(text: str) -> str:
+    """Take a path or an address as it is; refuse an empty one, which as a path is the working directory."""
+    if not text:
+        raise argparse.ArgumentTypeError("the name is empty")
+    return text
+
+
+def named_path(text: str) -> Path:
+    """Parse the path of a file or folder, which is not empty."""
+    return Path(file_name(text))
 
 
 def output_file(*suffixes: str) -> Callable[[str], Path]:

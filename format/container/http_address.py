@@ -3,7 +3,7 @@
 import base64
 import re
 from dataclasses import dataclass, field, replace
-from urllib.parse import quote, unquote, unquote_to_bytes, urljoin, urlsplit, urlunsplit
+from urllib.parse import SplitResult, quote, unquote, unquote_to_bytes, urljoin, urlsplit, urlunsplit
 
 from kpc.format.common.errors import NetworkError
 
@@ -20,6 +20,21 @@ PRINTABLE_ASCII = "".join(map(chr, range(0x21, 0x7F)))
 def is_url(text: str) -> bool:
     """Return whether `text` is an http or https address, not a path."""
     return text.partition("://")[0].lower() in SCHEMES and "://" in text
+
+
+def lacks_scheme(text: str) -> bool:
+    """Return whether `text` reads as an http or https address without its scheme, such as "localhost:8000/a.kpc"."""
+    return (
+        re.match(r"(localhost|([\w-]+\.)+[a-z]{2,}|\d+(\.\d+){3}|[\w.-]+(?=:\d))(:\d{1,5})?/", text, re.I) is not None
+    )
+
+
+def public_name(text: str) -> str:
+    """Return an address of any scheme without user, password, query and fragment, which may be secret."""
+    try:
+        return _split(text)[-1]
+    except ValueError:
+        return f"{printable(text.partition('://')[0])}://..."
 
 
 @dataclass(frozen=True)
@@ -50,24 +65,19 @@ class Address:
             NetworkError: it is not a valid http or https address; the message quotes no part that may be secret.
         """
         try:
-            # Browsers read "\\" as "/"; otherwise two readers could find two hosts in one address.
-            parts = urlsplit(re.sub(r"^[^?#]*", lambda match: match[0].replace("\\", "/"), text.strip()))
-            shown, port = parts.hostname or "", parts.port
+            parts, shown, port, name = _split(text)
             host = shown if ":" in shown else _ascii_host(shown)
         except ValueError:  # its text may quote a password, as may the exceptions that it stands for
             raise NetworkError(
                 "not a valid address; check its host and port, and write / ? # @ in a password as %2F %3F %23 %40"
             ) from None
-        netloc = (f"[{shown}]" if ":" in shown else shown) + (f":{port}" if port is not None else "")
-        name = printable(urlunsplit((parts.scheme, netloc, parts.path, "", "")))
         if parts.scheme not in SCHEMES:
             raise NetworkError(
                 f"{name}: no http or https address; other schemes cannot be read, so download it or give its path"
             )
         if not host:
             raise NetworkError(f"{name}: no http or https address, since it names no host; check it")
-        netloc = (f"[{host}]" if ":" in host else host) + (f":{port}" if port is not None else "")
-        url = urlunsplit((parts.scheme, netloc, _encoded(parts.path), _encoded(parts.query), ""))
+        url = urlunsplit((parts.scheme, _netloc(host, port), _encoded(parts.path), _encoded(parts.query), ""))
         port = DEFAULT_PORTS[parts.scheme] if port is None else port
         return Address(name, parts.scheme, host, port, url, _authorization(parts.netloc.rpartition("@")[0]))
 
@@ -96,6 +106,22 @@ class Address:
         before, after = ((address.scheme, address.port) for address in (other, self))
         same = self.host == other.host and (before == after or (before, after) == (("http", 80), ("https", 443)))
         return replace(self, authorization=other.authorization) if same and self.authorization is None else self
+
+
+def _split(text: str) -> tuple[SplitResult, str, int | None, str]:
+    """Return the parts of an address, its host, its port, and the address without what may be secret.
+
+    Raises:
+        ValueError: it is none; the text of the error may quote what is secret.
+    """
+    # Browsers read "\\" as "/"; otherwise two readers could find two hosts in one address.
+    parts = urlsplit(re.sub(r"^[^?#]*", lambda match: match[0].replace("\\", "/"), text.strip()))
+    host, port = parts.hostname or "", parts.port
+    return parts, host, port, printable(urlunsplit((parts.scheme, _netloc(host, port), parts.path, "", "")))
+
+
+def _netloc(host: str, port: int | None) -> str:
+    return (f"[{host}]" if ":" in host else host) + (f":{port}" if port is not None else "")
 
 
 def printable(text: str) -> str:

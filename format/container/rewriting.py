@@ -34,11 +34,8 @@ def with_chunks(reader: Reader, changed: Mapping[str, Chunk | None]) -> bytes:
 
 def save(data: bytes, path: str | os.PathLike[str]) -> int:
     """Write the bytes of a file; return its size. On failure the file at `path` is unchanged."""
-    try:
-        with atomic_write(path) as aside:
-            aside.write_bytes(data)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, os.fspath(path)) from error
+    with atomic_write(path) as aside:
+        aside.write_bytes(data)
     return len(data)
 
 

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, Protocol, runtime_checkable
 
+from kpc.format.common.errors import NetworkError
 from kpc.format.common.memory import DEFAULT_BUDGET
-from kpc.format.container.http_address import Address, is_url
+from kpc.format.container.http_address import Address, is_url, lacks_scheme
 
 
 @runtime_checkable
@@ -82,7 +83,12 @@ def open_source(source: AnySource, *, limit: int = DEFAULT_BUDGET) -> Source:
     if isinstance(source, str) and re.match(r"\s*[A-Za-z][A-Za-z0-9+.-]+://", source) and not os.path.exists(source):
         Address.parse(source)  # raises the error that names the schemes
     if isinstance(source, (str, os.PathLike)):
-        return _FileSource(Path(source))
+        try:
+            return _FileSource(Path(source))
+        except FileNotFoundError as error:
+            if isinstance(source, str) and lacks_scheme(source):
+                raise NetworkError(f"{source}: no such file; an address begins with http:// or https://") from error
+            raise
     if isinstance(source, (bytes, bytearray, memoryview)):
         return _BytesSource(bytes(source))
     if isinstance(source, Source):

@@ -137,8 +137,9 @@ class Metadata:
 def merged(parts: list[Metadata]) -> Metadata:
     """Return the metadata of a clip that is joined from parts with these.
 
-    They are the members that all parts agree on, of those that have them. The opening view is that of the first part,
-    and view limits around one focus become those that hold in all parts.
+    They are the members that all parts have and agree on: an author, a licence or a measured quality that some lack
+    does not hold for the whole. The opening view is that of the first part, and view limits around one focus become
+    those that hold in all parts.
     """
     documents = [part.document for part in parts]
     found = _agreed(documents)
@@ -168,10 +169,12 @@ def _intersection(limits: list[dict[str, Any] | None]) -> dict[str, Any] | None:
 
 
 def _agreed(documents: list[Mapping[str, Any]]) -> dict[str, Any]:
-    names = dict.fromkeys(name for document in documents for name in document)
+    """Return the members that all documents have and agree on; of provenance, its members that do."""
     found = {}
-    for name in names:
-        values = [document[name] for document in documents if name in document]
+    for name in documents[0] if documents else ():
+        if not all(name in document for document in documents):
+            continue
+        values = [document[name] for document in documents]
         if name == "provenance":
             found[name] = _agreed(values)
         elif all(value == values[0] for value in values):

@@ -90,6 +90,7 @@ def _parser() -> argparse.ArgumentParser:
     cli.add_version_option(parser)
     parser.add_argument(
         "scenes",
+        type=cli.file_name,
         nargs="+",
         metavar="scene",
         help="a .kpc file, its http address, or a folder of .kpc files; of several, the first one is shown first",
@@ -123,6 +124,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--path", metavar="JSON", help="a saved camera path, which the key J follows")
     parser.add_argument(
         "--folder",
+        type=cli.file_name,
         default=".",
         metavar="DIR",
         help="for screenshots, videos and camera paths; it is made (default: the working directory)",

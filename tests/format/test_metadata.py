@@ -72,13 +72,21 @@ def test_a_writer_refuses_what_a_reader_would():
 
 
 def test_merging_keeps_what_all_agree_on():
-    other = METADATA.with_members(title="Another", date=None).with_provenance(seed=8)
+    other = METADATA.with_members(title="Another").with_provenance(seed=8)
     found = merged([METADATA, other])
     assert "title" not in found.document and found.document["date"] == FULL["date"]
     assert "seed" not in found.provenance and found.provenance["preset"] == "balanced"
     assert found.document["later"] == FULL["later"]
-    assert merged([METADATA, Metadata()]) == METADATA.with_members(view_limits=None)
     assert not merged([Metadata(), Metadata()])
+
+
+def test_merging_leaves_out_what_some_lack():
+    """A licence, or a quality that was measured of one part, does not hold for the others."""
+    other = METADATA.with_members(licence=None).with_provenance(held_out=None)
+    found = merged([METADATA, other])
+    assert {"licence", "provenance"} <= FULL.keys() and "held_out" in FULL["provenance"]
+    assert "licence" not in found.document and "held_out" not in found.provenance
+    assert merged([METADATA, Metadata()]).document.keys() == {"opening"}
 
 
 def test_merging_keeps_the_view_limits_that_hold_in_all_parts():

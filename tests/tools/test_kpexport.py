@@ -188,6 +188,7 @@ def test_only_the_box_of_a_contracted_scene_is_exported(run: Run, tmp_path: Path
     ("arguments", "possible"),
     [
         (["scene.kpc", "-o", "points.obj"], ".ply or .glb"),
+        (["scene.kpc", "-o", ""], "the name is empty"),
         (["scene.kpc", "-o", "points.ply", "--format", "glb"], "contradicts"),
         (["scene.kpc", "-o", "points.ply", "--resolution", "64"], "--mesh"),
         (["scene.kpc", "-o", "points.ply", "--keyframes"], "cameras"),

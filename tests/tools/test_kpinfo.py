@@ -275,6 +275,28 @@ def test_addresses_of_other_schemes_are_refused_by_name(address, tmp_path, capsy
         assert "secret" not in error and "token" not in error
 
 
+def test_json_names_addresses_of_other_schemes_without_what_is_secret(capsys):
+    assert kpinfo.main(["--json", "ftp://me:secret@a.example/x.kpc?key=token", "file:///a/x.kpc", "s3://[/x.kpc"]) == 1
+    named = [one["file"] for one in json_of(capsys)["files"]]
+    assert named == ["ftp://a.example/x.kpc", "file:///a/x.kpc", "s3://..."]
+
+
+@pytest.mark.parametrize(
+    "address", ["localhost:8765/x.kpc", "localhost/x.kpc", "example.org/a/x.kpc", "10.0.0.1/x.kpc", "nas:8000/x.kpc"]
+)
+def test_an_address_without_its_scheme_is_recognised(address, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert kpinfo.main([address]) == 1
+    assert f"{address}: no such file; an address begins with http:// or https://" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("path", ["takes/x.kpc", "../x.kpc", "v1.2/x.kpc", "./localhost/x.kpc", "a.b.kpc"])
+def test_a_path_is_no_address_without_its_scheme(path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert kpinfo.main([path]) == 1
+    assert "http" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "content, complaint",
     [(b"", "not a .kpc file"), (b"RIFF" * 40, "not a .kpc file"), (b"\x89KPC\r\n\x1a\n", "cut off within the header")],

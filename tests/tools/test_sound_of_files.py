@@ -120,6 +120,8 @@ def test_films_at_another_speed_have_none_and_say_so(run: Run, folder, tmp_path,
     size = ("--size", "16x16", "--backend", "reference", "-o", tmp_path / "film.mp4")
     _, out, err = run(folder / "a.kpc", "--orbit", 4, *size)
     assert "with sound" not in out and err.count("does not play the clip at its own speed") == 1
+    _, out, err = run(folder / "a.kpc", "--time", 0.5, *size)
+    assert ": 1 frame at " in out and "with sound" not in out and "does not play the clip at its own speed" in err
 
     def refuse(_: object) -> np.ndarray:
         raise MediaError(opus.MISSING)

@@ -10,10 +10,10 @@ import numpy as np
 
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common import cli
-from kpc.format.common.errors import FormatError, KpcError, NetworkError, UsageError
+from kpc.format.common.errors import FormatError, KpcError, UsageError
 from kpc.format.container.container import Codec, Entry
 from kpc.format.container.groups import Groups
-from kpc.format.container.http_address import Address
+from kpc.format.container.http_address import public_name
 from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.container.sources import open_source
 from kpc.format.scene.motion import QuantisedMotion
@@ -107,12 +107,7 @@ def counted(count: int, noun: str) -> str:
 
 def _shown(file: str) -> str:
     """Return a path as it is, and an address without what is secret."""
-    if "://" not in file:
-        return file
-    try:
-        return Address.parse(file).name
-    except NetworkError:
-        return f"{file.partition('://')[0]}://..."
+    return public_name(file) if "://" in file else file
 
 
 def _clip(clip: Clip) -> dict[str, Any]:

@@ -40,6 +40,9 @@ from kpc.tools.rendering.outputs import Output
 from kpc.tools.rendering.shots import Shots, shots_of
 from kpc.tools.rendering.sound import write_sound
 
+# Contents that change colours and not depth, and their options.
+CUT_BY_THE_MATTE = {"moving": "--dynamic-only", "matte": "--matte", "map": "--dynamic-map"}
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
@@ -120,7 +123,9 @@ def _resolve_background(output: Output, options: argparse.Namespace) -> bool:
 
 
 def _check(shots: Shots, output: Output, options: argparse.Namespace) -> None:
-    """Refuse several pictures for one file, and pictures too large to render."""
+    """Refuse several pictures for one file, pictures too large to render, and films of two things at once."""
+    if options.depth and output.is_film and options.content in CUT_BY_THE_MATTE:
+        raise UsageError(f"--depth: a film shows depth or {CUT_BY_THE_MATTE[options.content]}; leave one of them out")
     if not output.is_film and not output.is_folder and len(shots) != 1:
         raise UsageError(
             f"-o {output.path}: {len(shots)} pictures do not go into one file; give a folder, a film or --time"

@@ -50,8 +50,15 @@ def parser() -> argparse.ArgumentParser:
         "player (.json) become cameras (.gltf, .usda, .usd, .usdc); those of a .gltf, .glb or USD file become a .json.",
     )
     cli.add_version_option(made)
-    made.add_argument("input", help="a .kpc file or its http address, or a file of cameras")
-    made.add_argument("-o", "--output", required=True, metavar="DIR|FILE", help="what to write; its suffix says which")
+    made.add_argument("input", type=cli.file_name, help="a .kpc file or its http address, or a file of cameras")
+    made.add_argument(
+        "-o",
+        "--output",
+        type=cli.file_name,
+        required=True,
+        metavar="DIR|FILE",
+        help="what to write; its suffix says which",
+    )
     made.add_argument("--format", choices=("ply", "glb"), help="of the files in a folder (default: ply)")
     times = made.add_argument_group("times; of a path, --fps sets the instants per second (default: 24)")
     add_times(times, is_rendering=False)

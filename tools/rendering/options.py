@@ -26,7 +26,7 @@ def parser() -> argparse.ArgumentParser:
         prog="kprender", description="Render a .kpc scene to pictures or a film, without a window."
     )
     cli.add_version_option(made)
-    made.add_argument("scene", help="a .kpc file, or its http address")
+    made.add_argument("scene", type=cli.file_name, help="a .kpc file, or its http address")
     _add_cameras(made.add_argument_group("cameras"))
     add_times(made.add_argument_group("times"))
     _add_content(made.add_argument_group("content"))
@@ -171,6 +171,7 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "-o",
         "--output",
+        type=cli.file_name,
         required=True,
         metavar="DIR|FILE",
         help="a folder for pictures (a name without suffix, or with / at its end), "

@@ -7,7 +7,7 @@ Time is continuous: frame n of a film is at n / fps seconds, whatever the rate o
 import argparse
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,12 +38,14 @@ class Timeline:
         fps: frames per second.
         at: the camera and the clip's time in [0, 1] at a frame, which need not be whole.
         names: of the frames; None to name them by their numbers.
+        is_stopped: whether --time stops the clip.
     """
 
     count: int
     fps: float
     at: Callable[[float], tuple[Camera, float]]
     names: tuple[str, ...] | None = None
+    is_stopped: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,14 @@ def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: boo
         DatasetError: a camera file cannot be used.
         UsageError: there are no such frames, or too many.
     """
-    timeline = _timeline(scene, clip, options, is_film)
+    timeline = replace(_timeline(scene, clip, options, is_film), is_stopped=options.time is not None)
     if timeline.count > MAX_PICTURES:
         raise UsageError(f"{timeline.count} pictures are more than {MAX_PICTURES}; choose a lower --fps")
+    has_span = options.frames not in (None, (0, 0)) or options.start_s is not None or options.end_s is not None
+    if timeline.is_stopped and has_span and options.cameras is options.path is options.orbit is None:
+        raise UsageError(
+            "--time stops the clip, so that there is one frame only; leave out --time, or --frames, --from and --to"
+        )
     first, last, fps = 0, timeline.count - 1, timeline.fps
     if options.frames is not None:
         first, last = options.frames

@@ -19,6 +19,8 @@ TOLERANCE_S = 1e-3
 
 def start_of(shots: Shots, clip: Clip) -> float | None:
     """Return when in the clip a film begins that plays it at its own speed, in seconds; None for any other film."""
+    if shots.timeline.is_stopped:
+        return None
     times = np.array([shots.time(number) for number in shots.numbers]) * clip.duration_s
     expected = np.minimum(times[0] + np.arange(len(times)) / shots.fps, clip.duration_s)
     return float(times[0]) if np.abs(times - expected).max() <= TOLERANCE_S else None
