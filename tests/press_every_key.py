@@ -415,6 +415,20 @@ def dropped_files(player: Player, scene_file: Path) -> None:
     player.window.drop([str(path)])
     player.frame()
     assert player.snapshot().keyframes == keyframes > 0 and not player.snapshot().notice_is_error
+    press(player, "k")
+    for file in (path, scene_file):  # neither replaces a path that is not saved
+        player.window.drop([str(file)])
+        player.frame()
+        shown = player.snapshot()
+        assert shown.asks and shown.keyframes == keyframes + 1
+        assert "opening" not in shown.notice and "loaded" not in shown.notice
+        press(player, glfw.KEY_ESCAPE)
+        assert not player.snapshot().asks and player.successor is None and not player.state.should_close
+    player.window.drop([str(path)])
+    player.frame()
+    player.state.follower.give_up()
+    player.frame()
+    assert player.snapshot().keyframes == keyframes and not player.snapshot().asks
     player.window.drop([str(scene_file)])
     player.run()
     assert player.successor is not None and not player.state.should_close
@@ -438,6 +452,8 @@ def resized_and_closed(player: Player) -> None:
     assert player.snapshot().canvas == window.pixels
     press(player, glfw.KEY_TAB, "k", glfw.KEY_ESCAPE)
     assert player.snapshot().asks  # what becomes of the keyframe
+    press(player, glfw.KEY_PAGE_DOWN)
+    assert "say first" in player.snapshot().notice
     press(player, glfw.KEY_ESCAPE)
     assert not player.snapshot().asks and not player.state.should_close
     glfw.set_window_should_close(window.handle, True)

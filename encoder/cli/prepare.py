@@ -73,6 +73,7 @@ def prepare_setting(options: Options) -> Setting:
         dataset = read_dataset(options)
         aabb, mapping, why = _find_space(dataset, options)
         sound, sound_from = find_sound(options, dataset)
+        options.trade.check_size(sound)
     except BaseException:
         remove_if_empty(options.work_dir)
         raise

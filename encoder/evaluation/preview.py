@@ -1,11 +1,12 @@
 """A small picture of a scene in training beside what was filmed: `kpenc --preview`."""
 
 import itertools
+import math
 import time
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 from kpc.encoder.datasets import Dataset, pixel_rays
 from kpc.encoder.evaluation.evaluate import SceneRenderer
@@ -19,7 +20,7 @@ from kpc.format.scene.space import DeviceCoordinates
 SIDE = 320  # pixels of the longer side of either picture, at most
 EVERY_S, AT_MOST_S = 10.0, 60.0  # seconds between two previews, at least and at most
 SHARE = 0.05  # of the time that previews may take, within these bounds
-CAPTION_HEIGHT = 14
+CAPTION_HEIGHT, CAPTION_LEFT = 14, 2
 BOX_COLOUR = (255, 200, 0)
 
 
@@ -61,7 +62,9 @@ class Preview:
         """Render the view and write the PNG."""
         drawn = np.clip(self._render(SceneRenderer(trainer.scene())), 0, 1)
         height, width = drawn.shape[:2]
-        image = Image.new("RGB", (2 * width, height + CAPTION_HEIGHT))
+        caption = self.caption(drawn, step)
+        room = math.ceil(ImageFont.load_default().getlength(caption)) + 2 * CAPTION_LEFT  # small pictures have less
+        image = Image.new("RGB", (max(2 * width, room), height + CAPTION_HEIGHT))
         draw = ImageDraw.Draw(image)
         for left, pixels in ((0, drawn), (width, self.truth)):
             image.paste(Image.fromarray((255 * pixels + 0.5).astype(np.uint8)), (left, 0))
@@ -69,7 +72,7 @@ class Preview:
             for left in (0, width):
                 for line in box_edges(self.dataset, self.number, trainer.aabb, self.stride):
                     draw.line([(x + left, y) for x, y in line], fill=BOX_COLOUR)
-        draw.text((2, height + 1), self.caption(drawn, step), fill=(255, 255, 255))
+        draw.text((CAPTION_LEFT, height + 1), caption, fill=(255, 255, 255))
         with atomic_write(self.path) as temporary:
             image.save(temporary)
 

@@ -315,6 +315,7 @@ def code(
     Raises:
         TrainingError: no file of this model is as small as the target.
     """
+    trade.check_size(model.scene.sound)
     coder = _Coder(model, trade, prune_share, tune_steps, quantise, grids)
     chosen = coder.select()
     tolerance = TOLERANCE if model.effort == 1 else QUICK_TOLERANCE

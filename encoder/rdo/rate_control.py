@@ -29,7 +29,10 @@ from kpc.format.coding.quantise import (
     looked_up_cells,
     round_decoder,
 )
+from kpc.format.common.errors import TrainingError
+from kpc.format.container.container import ENTRY, HEADER
 from kpc.format.scene.scene import Scene
+from kpc.format.scene.sound import Sound
 
 # Base-two logarithms of the factors on all steps, between which one is searched for a trained scene.
 FINEST, COARSEST = -13.0, 2.0
@@ -63,6 +66,10 @@ QuantiseFunction = Callable[[Scene, PerPlane, np.ndarray, PerPlane], QuantisedSc
 TuneFunction = Callable[[PerPlane, np.ndarray], QuantisedScene]
 
 
+# Chunks that every file has: scene, decoder, occupancy, and the three space planes of a scale.
+MIN_CHUNKS = 6
+
+
 @dataclass(frozen=True)
 class Trade:
     """The rate-distortion target: at most one of these is set; none stands for a loss of DEFAULT_LOSS_DB.
@@ -89,6 +96,24 @@ class Trade:
             if (value := getattr(self, name)) is not None:
                 return name, float(value)
         return "max_loss_db", DEFAULT_LOSS_DB
+
+    def check_size(self, sound: Sound | None) -> None:
+        """Refuse a size that what is not coded by rate and distortion takes alone, before hours are spent.
+
+        Args:
+            sound: of the file.
+
+        Raises:
+            TrainingError: header, index and sound take more.
+        """
+        heard = 0 if sound is None else sum(map(len, sound.packets))
+        least = HEADER.size + MIN_CHUNKS * ENTRY.size + heard
+        if self.target_bytes is not None and self.target_bytes < least:
+            remedy = ", or encode with less sound (--audio-bitrate, --audio none)" if heard else ""
+            raise TrainingError(
+                f"--target-size: header, index and sound alone take {least:,} bytes, more than {self.target_bytes:,}; "
+                f"give a larger size{remedy}"
+            )
 
     def loss_db(self, psnr: float) -> float:
         """Return the PSNR that coding may cost, about, dB; NaN for a size, of which that is not known.

@@ -14,7 +14,7 @@ from kpc.player.app.playlist import Playlist
 from kpc.player.app.preferences import TEXT_SIZES
 from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.scene_view import SceneView
-from kpc.player.app.state import PlayerState, Shown
+from kpc.player.app.state import Notice, PlayerState, Shown
 from kpc.player.app.widgets import close_lists
 from kpc.player.cpu.reference import Part
 from kpc.player.gl.presentation import DisplayMode
@@ -33,6 +33,7 @@ PART_NAMES = {Part.FULL: "everything", Part.STATIC: "static", Part.DYNAMIC: "dyn
 TEXT_STEP = 1.1
 # Difference between two volumes.
 VOLUME_STEP = 0.1
+UNANSWERED = "the camera path is not saved; say first what becomes of it"
 NO_PATH = "there is no camera path yet; press K to add a keyframe"
 
 
@@ -53,6 +54,7 @@ class Actions:
         self.successor_file = ""
         self.dialog = OpenDialog()
         self._to_open: str | None = None
+        self._path_to_load: tuple[CameraPath, str] | None = None  # and its file
 
     # --- the clip
 
@@ -246,20 +248,39 @@ class Actions:
         """Open the file that is `count` files further in the playlist."""
         if len(self.playlist.files) < 2:
             self.state.notify("there is one file only; Ctrl+O opens another")
+        elif self.asks:
+            self.state.notify(UNANSWERED)
         else:
             self.open(self.playlist.step(count))
 
     def open(self, file: str) -> None:
-        """Load a camera path (.json), or have `open_waiting` open another scene."""
+        """Load a camera path (.json) unless another is unsaved, or have `open_waiting` open another scene."""
         state = self.state
+        if self.asks:
+            state.notify(UNANSWERED)
+            return
         if not file.lower().endswith(".json"):
             self._to_open = file
             state.notify(f"opening {Path(file).name if not is_url(file) else 'the address'}")
             return
         with state.reporting_errors(file):
-            state.follower.replace(CameraPath.load(file))
-            state.visible.path = True
-            state.notify(f"loaded {len(state.follower.path.keyframes)} keyframes from {file}; press J to follow them")
+            self._path_to_load = CameraPath.load(file), file
+            self.load_waiting_path()
+
+    def load_waiting_path(self) -> None:
+        """Take over the camera path that was opened last, once the one that is there is saved or given up."""
+        if self._path_to_load is None or self.asks:
+            return
+        (path, file), self._path_to_load, state = self._path_to_load, None, self.state
+        state.follower.replace(path)
+        state.visible.path = True
+        state.notify(f"loaded {len(path.keyframes)} keyframes from {file}; press J to follow them")
+
+    @property
+    def asks(self) -> bool:
+        """Whether to ask what becomes of an unsaved camera path, since the player is to end or show something else."""
+        is_leaving = self.state.should_close or self.successor is not None or self._path_to_load is not None
+        return is_leaving and self.state.follower.is_unsaved
 
     @property
     def is_opening(self) -> bool:
@@ -278,6 +299,8 @@ class Actions:
             try:
                 stream.draw_with(self.scene_view.make_renderer)
                 self.successor, self.successor_file = stream, file
+                if self.asks:
+                    state.notice = Notice()  # it is not opened yet
             except BaseException:
                 stream.close()
                 raise
@@ -286,7 +309,7 @@ class Actions:
         """Close an open list, or else end the player; if it asks about an unsaved camera path, stay."""
         if close_lists():
             return
-        if self.state.should_close:
+        if self.asks:
             self.stay()
         else:
             self.state.should_close = True
@@ -294,7 +317,7 @@ class Actions:
     def stay(self) -> None:
         """Go on with the scene that is shown, whatever was to follow."""
         self.state.should_close = False
-        self.playlist.position = self._shown_at
+        self.playlist.position, self._path_to_load = self._shown_at, None
         if self.successor is not None:
             self.successor.close()
             self.successor = None

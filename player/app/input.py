@@ -174,6 +174,7 @@ class Input:
         chosen = self.actions.dialog.take_chosen()
         for file in (*self.window.take_dropped_files(), *([] if chosen is None else [chosen])):
             self.actions.open(file)
+        self.actions.load_waiting_path()
 
     def _move_pointer(self) -> None:
         """Orbit, pan and zoom where no panel takes the pointer.

@@ -1,4 +1,4 @@
-"""The question what becomes of an unsaved camera path before the player ends or shows another scene."""
+"""The question what becomes of an unsaved camera path before the player ends, or shows another scene or path."""
 
 from kpc.player.app.actions import Actions
 from kpc.player.app.desktop import imgui

@@ -72,7 +72,7 @@ class PathPanel:
             self.actions.to_path_position(position_s)
 
     def _keyframe(self, number: int) -> None:
-        """A row of the list: go there, seconds since the keyframe before, the clip's time, remove."""
+        """A row of the list: go there, seconds since the keyframe before, the clip's time in seconds, remove."""
         follower = self.state.follower
         if number >= len(follower.path.keyframes):
             return  # a keyframe before it has just been removed
@@ -94,7 +94,9 @@ class PathPanel:
         else:
             imgui.dummy((em(5), 0))
         imgui.same_line()
-        imgui.text_disabled(f"t {keyframe.time:.2f}")
+        clip = self.state.stream.clip
+        imgui.text_disabled(f"{keyframe.time * clip.duration_s:.2f} s")
+        tip(f"Time of the clip: frame {keyframe.time * (clip.frame_count - 1):.1f} of {clip.frame_count}, from 0")
         imgui.same_line()
         if imgui.button("x", (em(1.8), 0)):
             follower.remove(number)

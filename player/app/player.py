@@ -223,7 +223,7 @@ class Player:
         self._is_still = self.scene_view.is_sharp and not is_timed and self.filming.recording is None
         self.state.statistics.record_frame(seconds, moves=is_timed or self.filming.is_along_path)
         self._close_or_ask()
-        self.panels.build(asks=self._asks)
+        self.panels.build(asks=self.actions.asks)
         self._present()
         if is_timed:  # the frame without waiting for the screen, and without measuring statistics
             self.state.quality.record(clock.monotonic() - now - (self.scene_view.measuring_s - measuring_s))
@@ -238,7 +238,7 @@ class Player:
         """Save the window with its panels at full resolution as a PNG file."""
         self._begin_panels(1 / 60)
         self.scene_view.draw_still()
-        self.panels.build(asks=self._asks)
+        self.panels.build(asks=self.actions.asks)
         self.imgui.draw(self.scene_view.canvas)
         write_image(path, self.scene_view.pixels())
         self.scene_view.invalidate()
@@ -266,7 +266,7 @@ class Player:
     def present_panels(self) -> None:
         """Build the panels and show them over the canvas, without drawing the scene or swapping buffers."""
         self._begin_panels(0.0)
-        self.panels.build(asks=self._asks)
+        self.panels.build(asks=self.actions.asks)
         self._present()
 
     def forget_failures(self) -> None:
@@ -294,7 +294,7 @@ class Player:
             keyframes=len(follower.path.keyframes),
             follows_path=follower.is_active,
             films=self.filming.recording is not None,
-            asks=self._asks,
+            asks=self.actions.asks,
             panels=frozenset(name for name, is_shown in vars(state.visible).items() if is_shown),
             notice=state.notice.text,
             notice_is_error=state.notice.is_error,
@@ -306,19 +306,14 @@ class Player:
     # --- parts of a frame
 
     @property
-    def _asks(self) -> bool:
-        """Whether the window asks what becomes of an unsaved camera path."""
-        return self.state.follower.is_unsaved and (self.state.should_close or self.successor is not None)
-
-    @property
     def _is_over(self) -> bool:
-        return (self.state.should_close or self.successor is not None) and not self._asks
+        return (self.state.should_close or self.successor is not None) and not self.actions.asks
 
     def _close_or_ask(self) -> None:
         """Take over that the user has closed the window; doing so again while it asks closes it."""
         if self.window.should_close:
             self.window.keep_open()
-            if self._asks:
+            if self.actions.asks:
                 self.state.follower.give_up()
             self.state.should_close = True
 

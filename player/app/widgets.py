@@ -18,7 +18,7 @@ MARGIN_EM, SPACING_EM = 0.8, 0.4
 # Width of the panels along the lower edge, at most, em.
 MAX_BAR_EM = 60.0
 # Room that the panels need: the text grows no further than a window has it, em.
-ROOM_EM = 40.0, 24.0
+ROOM_EM = 41.5, 24.0
 # Width of a text about a widget, at most, em.
 TIP_EM = 24.0
 # Width of a message over the room it has.

@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
+from PIL import ImageFont
 
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation import preview as module
@@ -19,9 +21,13 @@ def test_a_preview_shows_the_scene_beside_the_truth(moving: Dataset, tmp_path: P
     preview.update(run, 7)
     image = read_image(path)
     height, width = moving.pictures.height[preview.number], moving.pictures.width[preview.number]
-    assert image.shape == (height + CAPTION_HEIGHT, 2 * width, 3)
+    length = ImageFont.load_default().getlength(preview.caption(np.zeros_like(preview.truth), 7))
+    assert length > 2 * width  # the caption makes the picture wider
+    assert image.shape == (height + CAPTION_HEIGHT, pytest.approx(length, abs=12), 3)
+    ink = np.flatnonzero(image[height:].any(axis=(0, 2)))
+    assert image.shape[1] - 12 < ink[-1] < image.shape[1] - 1  # to its last letter
     truth = (255 * ground_truth(moving, preview.number) + 0.5).astype(np.uint8)
-    shown = image[:height, width:]
+    shown = image[:height, width : 2 * width]
     is_box = (shown == BOX_COLOUR).all(axis=-1)
     np.testing.assert_array_equal(shown[~is_box], truth[~is_box])
     path.unlink()
@@ -37,7 +43,7 @@ def test_large_pictures_are_previewed_small(moving: Dataset, tmp_path: Path, mon
     preview = Preview(moving, tmp_path / "out.preview.png")
     assert max(preview.truth.shape[:2]) <= 10
     preview.write(trainer(moving), 1)
-    assert read_image(preview.path).shape[1] == 2 * preview.truth.shape[1]
+    assert read_image(preview.path).shape[0] == preview.truth.shape[0] + CAPTION_HEIGHT
 
 
 def test_edges_of_the_box_end_at_its_corners(moving: Dataset) -> None:

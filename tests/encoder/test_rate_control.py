@@ -30,7 +30,9 @@ from kpc.encoder.rdo.rate_control import (
 )
 from kpc.encoder.rdo.rate_search import MAX_TUNINGS
 from kpc.format.coding.quantise import QuantisedScene, quantise_scene, round_decoder
+from kpc.format.common.errors import TrainingError
 from kpc.format.scene.scene import Scene
+from kpc.format.scene.sound import Sound
 from scenes import tiny_scene
 
 # Quantised scenes by the arguments that they were made of: the searches of many tests begin with the same steps.
@@ -182,6 +184,16 @@ def test_a_file_is_never_coded_with_finer_steps() -> None:
         assert judged.quantised is whole
     smaller = controller(whole.dequantise(), own, ALIKE, measure, 30.0, whole).meet(Trade(target_bytes=int(0.8 * size)))
     assert 0.7 * size < smaller.size_bytes <= 0.8 * size
+
+
+def test_a_size_that_sound_alone_takes_is_refused_at_once() -> None:
+    sound = Sound(1, 312, 960, (bytes(5000),))
+    Trade().check_size(sound)
+    Trade(target_bytes=6000).check_size(sound)
+    Trade(target_bytes=300).check_size(None)
+    for target, heard, words in ((5000, sound, "give a larger size, or encode with less sound"), (5, None, "larger")):
+        with pytest.raises(TrainingError, match=f"index and sound alone take .* more than {target:,}; .*{words}"):
+            Trade(target_bytes=target).check_size(heard)
 
 
 def test_targets_as_a_loss_in_decibels() -> None:
