@@ -323,9 +323,12 @@ def tap_weights(weights):
     """
     sets = np.empty((len(weights), 1 + WEIGHT_COUNT), np.int32)
     for c in range(len(weights)):
-        rest = 64 - weights[c, 1:].sum()
-        sets[c, 0], sets[c, 1] = rest + weights[c, 0], rest - weights[c, 0]
-        sets[c, 2:] = 2 * weights[c, 1:].astype(np.int32)
+        first, rest = int(weights[c, 0]), 64
+        for k in range(1, WEIGHT_COUNT):
+            other = int(weights[c, k])
+            rest -= other
+            sets[c, k + 1] = 2 * other
+        sets[c, 0], sets[c, 1] = rest + first, rest - first
     return sets
 
 

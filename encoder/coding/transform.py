@@ -261,7 +261,7 @@ def code_levels(levels, offsets, busy, step_table, state, position, words, trace
                 predicted = (expected + (steps[0, 0] >> 1)) // steps[0, 0]
                 block[:] = 0
                 if levels is not None and words is None:
-                    block[:] = levels[m, by, bx]
+                    copy_matrix(levels[m, by, bx], block)
                     block[0, 0] -= predicted
                 first = end_context(end[Y, X - 1], end[Y - 1, X], end_before[Y, X]) * MODELS_PER_END
                 last, state, position = code_unsigned(
@@ -300,9 +300,10 @@ def code_levels(levels, offsets, busy, step_table, state, position, words, trace
                     trace,
                 )
                 if levels is not None and words is not None:
-                    levels[m, by, bx] = block
+                    copy_matrix(block, levels[m, by, bx])
                 inverse_transform(block, steps, dct_basis, columns)
-                right[:], bottom[bx] = block[:, N - 1], block[N - 1]
+                for i in range(N):
+                    right[i], bottom[bx, i] = block[i, N - 1], block[N - 1, i]
                 if symbols is not None:
                     store_block(block, symbols, coded, by, bx, m)
             if words is not None and position > words.size:
@@ -310,6 +311,17 @@ def code_levels(levels, offsets, busy, step_table, state, position, words, trace
         size, before = before, size
         end, end_before = end_before, end
     return state, position
+
+
+@inlined
+def copy_matrix(source, target):
+    """Fill a matrix from another that is at least as large.
+
+    With `target[:] = source`, numba would also compile the message about unequal shapes, which takes seconds.
+    """
+    for i in range(len(target)):
+        for j in range(target.shape[1]):
+            target[i, j] = source[i, j]
 
 
 @inlined

@@ -35,6 +35,7 @@ from kpc.encoder.coding.transform import (
     TransformBlocks,
     border_sum,
     coded_blocks,
+    copy_matrix,
     dct_basis,
     empty_magnitudes,
     encode_blocks,
@@ -346,7 +347,7 @@ def _search(problem, levels, bits, errors):
                 predicted = math.floor(expected / step[0, 0] + 0.5)
                 _load_errors(problem, scratch, from_channels, block, step, by, bx, m)
                 _descend(problem, scratch, magnitudes, bits.levels, block, step, predicted)
-                scratch.magnitudes[:] = magnitudes.here[:N, :N]
+                copy_matrix(magnitudes.here, scratch.magnitudes)
                 context = end_context(ends[Y, X - 1], ends[Y - 1, X], earlier_ends[Y, X])
                 end = _trim(problem, scratch, magnitudes, bits.levels, bits.ends[context], block, step)
                 ends[Y, X], means[Y, X] = end, block[0, 0] * step[0, 0]

@@ -126,7 +126,8 @@ def march_blocks(blocks, side, view, march, uniform_distance, occupancy, motion,
     )
     if planes is not None:
         if len(planes.b1) > 0:
-            lanes.weights_of[:] = np.arange(LANES)
+            for lane in range(LANES):
+                lanes.weights_of[lane] = lane
     # Plain zeros would have a type of their own, for which parts would be compiled once more.
     taken, count = np.int64(0), np.int64(0)
     while taken < len(blocks) or count > 0:
