@@ -15,7 +15,8 @@ from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import MediaError
 from kpc.format.container.clip_sound import parts_of, sample_at, sound_spans
 from kpc.format.container.container import Reader
-from kpc.format.container.groups import Groups, Span, Timeline
+from kpc.format.container.groups import GroupInput, Groups, Span, Timeline
+from kpc.format.container.groups import write as write_groups
 from kpc.format.container.scene_io import read
 from kpc.format.scene.scene import Clip
 from kpc.format.scene.sound import SAMPLE_RATE
@@ -66,7 +67,18 @@ def test_kpinfo_says_what_is_heard(folder, capsys):
     jsonschema.validate(document, schema)
     (group,) = document["files"][0]["groups"]
     stored = sum(entry.stored_length for entry in Reader(folder / "a.kpc").index if entry.kind == "soun")
-    assert group["sound"] == {"channels": 1, "duration_s": 1.1, "stored_bytes": stored}
+    assert group["sound"] == {"channels": 1, "duration_s": 1.1, "heard_s": 1.1, "stored_bytes": stored}
+
+
+def test_kpinfo_counts_what_groups_share_once(folder, tmp_path, capsys):
+    parts = [GroupInput.of(folder / f"{name}.kpc", start) for name, start in (("a", 0), ("b", 7))]
+    write_groups(parts, tmp_path / "clip.kpc")
+    assert kpinfo.main([str(tmp_path / "clip.kpc"), "--json"]) == 0
+    sounds = [group["sound"] for group in json.loads(capsys.readouterr().out)["files"][0]["groups"]]
+    assert [sound["duration_s"] for sound in sounds] == [1.1, 1.1]
+    assert [sound["heard_s"] for sound in sounds] == pytest.approx([0.85, 0.95])  # from frame 8.5 on the second
+    assert kpinfo.main([str(tmp_path / "clip.kpc")]) == 0
+    assert "\n  sound       Opus, mono, 1.80 s, " in capsys.readouterr().out
 
 
 def test_a_joined_clip_sounds_as_if_it_had_never_been_cut(folder):
@@ -98,6 +110,8 @@ def test_another_rate_keeps_the_sound_and_another_speed_does_not(folder, capsys)
     out = folder / "other.kpc"
     assert kpedit.main([str(folder / "a.kpc"), "-o", str(out), "--fps", "20"]) == 0
     assert read(out).sound == read(folder / "a.kpc").sound
+    assert kpedit.main([str(folder / "a.kpc"), "-o", str(out), "--speed", "1"]) == 0
+    assert read(out).sound == read(folder / "a.kpc").sound and "left out" not in capsys.readouterr().err
     for name in ("a.kpc", "clip.kpc"):
         capsys.readouterr()
         assert kpedit.main([str(folder / name), "-o", str(out), "--speed", "2"]) == 0

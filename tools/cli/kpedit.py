@@ -145,7 +145,8 @@ def _edits_from(options: argparse.Namespace) -> Edits:
             turn = axis_turn(axis, degrees) @ turn
         placement = Placement(turn, options.scale or 1.0, np.array(options.move or (0.0, 0.0, 0.0)))
     box = None if options.box is None else np.reshape(options.box, (2, 3))
-    return Edits(part_s, box, placement, options.speed, options.fps)
+    speed = None if options.speed == 1 else options.speed
+    return Edits(part_s, box, placement, speed, options.fps)
 
 
 def _history(options: argparse.Namespace) -> list[str]:

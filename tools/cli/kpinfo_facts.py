@@ -11,6 +11,7 @@ import numpy as np
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, KpcError, UsageError
+from kpc.format.container.clip_sound import SoundSpan, sound_spans
 from kpc.format.container.container import Codec, Entry
 from kpc.format.container.groups import Groups
 from kpc.format.container.http_address import public_name
@@ -68,7 +69,7 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
             )
         header, clip = groups.reader.header, groups.clip
         info |= {"version": header.version, "expected_bytes": header.file_length, "clip": _clip(clip)}
-        info["groups"] = [_group(groups, number) for number in range(len(groups))]
+        info["groups"] = [_group(groups, span) for span in sound_spans(groups.timeline)]
         info["clip"]["is_dynamic"] = any(one["is_dynamic"] for one in info["groups"])
         info |= {"cameras": len(groups.cameras()), "metadata": dict(groups.metadata().document)}
         if verify:
@@ -114,9 +115,10 @@ def _clip(clip: Clip) -> dict[str, Any]:
     return {"frame_count": clip.frame_count, "fps": clip.fps, "duration_s": clip.total_s}
 
 
-def _group(groups: Groups, number: int) -> dict[str, Any]:
+def _group(groups: Groups, heard: SoundSpan) -> dict[str, Any]:
     """Return what header, index and SCNE of a group say; the group of a file without groups is the whole file."""
-    span, clip = groups.timeline.spans[number], groups.clip
+    number, clip = heard.group, groups.clip
+    span = groups.timeline.spans[number]
     since, until = (time * clip.duration_s for time in groups.timeline.display_span(number))
     if number == len(groups) - 1:
         until = clip.total_s  # The last frame is shown as long as the others.
@@ -131,19 +133,21 @@ def _group(groups: Groups, number: int) -> dict[str, Any]:
         "value_count": head.value_count if head else None,
         "scale_count": len(head.scales) if head else None,
         "is_dynamic": head.is_dynamic if head else None,
-        "sound": _sound(groups.open(number)) if head else None,
+        "sound": _sound(groups.open(number), heard) if head else None,
         "scene": None,
     }
 
 
-def _sound(reader: SceneReader) -> dict[str, Any] | None:
+def _sound(reader: SceneReader, heard: SoundSpan) -> dict[str, Any] | None:
     """Return what the index and the first soun chunk say; None without one, or where it is missing."""
     numbers = reader.sound_numbers
     if not numbers or not reader.available(numbers[0]):
         return None
     first, size = reader.sound_segment(numbers[0]), sum(reader.index[number].stored_length for number in numbers)
     duration_s = first.sample_count / SAMPLE_RATE
-    return {"channels": first.channels, "duration_s": duration_s, "stored_bytes": size}
+    heard_samples = min(first.sample_count, heard.stop - heard.start) - (heard.first - heard.start)
+    heard_s = max(heard_samples, 0) / SAMPLE_RATE
+    return {"channels": first.channels, "duration_s": duration_s, "heard_s": heard_s, "stored_bytes": size}
 
 
 def _verify(groups: Groups, numbers: Sequence[int], info: dict[str, Any]) -> None:

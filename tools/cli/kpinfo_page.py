@@ -100,10 +100,12 @@ def _sound(groups: Sequence[Mapping[str, Any]]) -> list[str]:
     sounds = [group["sound"] for group in groups if group["sound"] is not None]
     if not sounds:
         return []
-    size, duration_s = (sum(sound[name] for sound in sounds) for name in ("stored_bytes", "duration_s"))
+    # Groups share frames, of whose sound that of one is heard.
+    length = "heard_s" if len(groups) > 1 else "duration_s"
+    size, duration_s = (sum(sound[name] for sound in sounds) for name in ("stored_bytes", length))
     kind = "mono" if all(sound["channels"] == 1 for sound in sounds) else "stereo"
     some = f", in {len(sounds)} of {len(groups)} groups" if len(sounds) < len(groups) else ""
-    text = f"Opus, {kind}, {duration_s:.2f} s{some}, {size:,} bytes, {size / duration_s:,.0f} a second"
+    text = f"Opus, {kind}, {duration_s:.2f} s{some}, {size:,} bytes, {size / max(duration_s, 1e-3):,.0f} a second"
     return _item("sound", text)
 
 
