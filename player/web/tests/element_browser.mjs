@@ -576,6 +576,46 @@ scenario('draws again once a lost context is back', async () => {
   await close(page);
 });
 
+scenario('fills the screen, or the window where it may not', async () => {
+  const page = await open(TAG);
+  await shown(page);
+  await button(page, 'Fill the screen').click();
+  await until(page, (it) => document.fullscreenElement === it);
+  await inside(page, '.stage').press('f');
+  await until(page, () => document.fullscreenElement === null);
+  await page.evaluate(() => Object.defineProperty(document, 'fullscreenEnabled', { value: false }));
+  await button(page, 'Fill the screen').click();
+  const size = () => player(page, (it) => [it.clientWidth, it.clientHeight]);
+  assert.deepEqual(await size(), [420, 300]);
+  await inside(page, '.stage').press('Escape');
+  assert.deepEqual(await size(), [240, 180]);
+  await button(page, 'Fill the screen').waitFor();
+  await close(page);
+});
+
+scenario('draws coarsely where the card lacks memory, before it gives up', async () => {
+  const page = await open(TAG.replace('fastest', 'fine'), {
+    before: (it) =>
+      it.addInitScript(() => {
+        globalThis.failing = [240];
+        const { texStorage2D } = WebGL2RenderingContext.prototype;
+        WebGL2RenderingContext.prototype.texStorage2D = function (...args) {
+          if (globalThis.failing.includes(args[3])) throw new RangeError('Array buffer allocation failed');
+          texStorage2D.apply(this, args);
+        };
+      }),
+  });
+  await shown(page);
+  const shownSize = () => player(page, (it) => it.shadowRoot.querySelector('canvas').width);
+  assert.equal(await shownSize(), 120);
+  await page.evaluate(() => {
+    globalThis.failing = [240, 60];
+    document.querySelector('kpc-player').load();
+  });
+  await until(page, (it) => it.error?.code === 'budget');
+  await close(page);
+});
+
 scenario('shows the poster and loads nothing before it is asked to', async () => {
   const page = await open(TAG.replace('muted', 'muted preload="none" poster="poster.png"'));
   await page.waitForTimeout(200);
