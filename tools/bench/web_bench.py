@@ -19,7 +19,7 @@ from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rig import Rig
 from kpc.player.quality import LEVELS
 from kpc.player.viewpoints import fit_camera
-from kpc.tools.bench import web_page
+from kpc.tools.bench import decode_bench, web_page
 from kpc.tools.bench.records import Record
 
 # Devices: filtered RGBA16F texels that they look up a second, and the frames a second that they are to hold.
@@ -92,7 +92,12 @@ def measure(job: Drawing) -> tuple[str, dict[Setting, Record]]:
         found[setting] |= {"psnr": float(psnr(got, reference)), "chosen_on": devices}
     measured = {setting: found[setting] for setting in shown}
     (drawn,) = values(("picture", [job_of({"level": "fastest", "scale": 0.1})]))
-    return drawn["name"], measured | (_timed(run, job_of, camera, reference, measured) if job.is_timed else {})
+    if not job.is_timed:
+        return drawn["name"], measured
+    ((setting, played),) = _timed(run, job_of, camera, reference, measured).items()
+    (played["decode_ms"],) = values(("decode", [job.scene.name]))
+    played["python_decode_ms"] = decode_bench.measure(job.scene)["decode_ms"]
+    return drawn["name"], measured | {setting: played}
 
 
 def _looked_up(counted: Record, size: tuple[int, int], is_dynamic: bool) -> Record:

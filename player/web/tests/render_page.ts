@@ -1,5 +1,7 @@
 /** A page that draws scenes on demand, for tests and benches in a real browser; `browser.mjs` drives it. */
 
+import { Scene } from '../src/container/scene.js';
+import { loadCore } from '../src/decoder/module.js';
 import { Layout } from '../src/render/atlas.js';
 import { type Camera, texelsPerPixel } from '../src/render/camera.js';
 import type { DrawnScene } from '../src/render/drawn_scene.js';
@@ -162,6 +164,20 @@ const page = {
       shown.push(performance.now());
     }
     return { ms: shown.slice(1).map((at, i) => at - shown[i]), level: state?.level, scale: state?.scale };
+  },
+
+  /** Decode all segments of a scene on one core; return the milliseconds of the second time, when all is compiled. */
+  async decode(file: string): Promise<number> {
+    const bytes = new Uint8Array(await (await fetch(`/${file}`)).arrayBuffer());
+    const core = await loadCore();
+    let took = 0;
+    for (let turn = 0; turn < 2; turn++) {
+      const scene = new Scene(bytes, core);
+      const started = performance.now();
+      for (const [number, { kind }] of scene.container.index.entries()) if (kind === 'PLNE') scene.segment(number);
+      took = performance.now() - started;
+    }
+    return took;
   },
 
   /** Draw pictures one after the other, all that they need being there; return the milliseconds that each took. */
