@@ -87,7 +87,7 @@ def _export_geometry(task: Task, options: argparse.Namespace) -> None:
         write_geometry(path, shape, placement)
         count += len(shape.points)
     what = "vertices" if options.mesh else "points"
-    files = f"{len(shots)} files, " if task.is_folder else ""
+    files = f"{len(shots)} file{'s' * (len(shots) != 1)}, " if task.is_folder else ""
     print(f"{output}: {files}{count:,} {what}, in {clock.monotonic() - started:.1f} s")
 
 
