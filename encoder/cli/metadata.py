@@ -21,7 +21,7 @@ from kpc.format.scene.view_limits import find_view, view_members
 # Options that say where and when a run worked, not what it made, and those that the provenance names apart.
 NOT_RECORDED = {
     "source", "output", "work", "keep", "resume", "device", "keep_checkpoint", "ablation", "test_views", "preview",
-    "time_budget_s", "trade", "members", "view_limits", "preset", "seed", "only",
+    "time_budget_s", "trade", "members", "view_limits", "preset", "seed", "only", "wishes",
 }  # fmt: skip
 # Bytes that the figures of `with_figures` may add to a file.
 FIGURES_BYTES = 200
@@ -55,7 +55,7 @@ def describe(options: Options, dataset: Dataset, scene: Scene, cameras: list[int
         layout=dataset.layout,
         preset=options.preset,
         seed=options.seed,
-        options={**chosen, name: value},
+        options={**chosen, **options.wishes.changed(), name: value},
     )
     return with_view(metadata, scene, options.view_limits)
 

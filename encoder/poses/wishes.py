@@ -24,6 +24,12 @@ class Wishes:
     distance: tuple[str, str, float] | None = None
     require_all: bool = False
 
+    def changed(self) -> dict[str, str]:
+        """Return what differs from the defaults and may change the cameras, as text by the names of options."""
+        distance = None if self.distance is None else "{},{}={:g}".format(*self.distance)
+        given = {"rig": self.rig, "sync": self.sync, "distance": distance}
+        return {name: value for name, value in given.items() if value not in ("auto", None)}
+
 
 def add_pose_options(parser: argparse.ArgumentParser) -> None:
     """Add the options from which `wishes_from` makes wishes."""

@@ -322,8 +322,8 @@ def code(
     found, pruned = coder.meet(chosen, tune_steps, tolerance), chosen.pruned
     if trade.target_bytes is not None and found.size_bytes > trade.target_bytes:
         raise TrainingError(
-            f"{found.size_bytes:,} bytes is the smallest size of this model, more than {trade.target_bytes:,}; give "
-            "another --target-size, or train anew with a smaller --preset"
+            f"{found.size_bytes:,} bytes is the smallest size of this model, and --target-size leaves "
+            f"{trade.target_bytes:,} for it; give a larger one, or train anew with a smaller --preset"
         )
     if model.coded is not None:
         unchanged = Attempt(model.coded, coder.measure, 0.0)

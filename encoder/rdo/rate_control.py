@@ -111,8 +111,8 @@ class Trade:
         if self.target_bytes is not None and self.target_bytes < least:
             remedy = ", or encode with less sound (--audio-bitrate, --audio none)" if heard else ""
             raise TrainingError(
-                f"--target-size: header, index and sound alone take {least:,} bytes, more than {self.target_bytes:,}; "
-                f"give a larger size{remedy}"
+                f"--target-size leaves {self.target_bytes:,} bytes for the scene, and header, index and sound alone "
+                f"take {least:,}; give a larger size{remedy}"
             )
 
     def loss_db(self, psnr: float) -> float:

@@ -192,7 +192,7 @@ def test_a_size_that_sound_alone_takes_is_refused_at_once() -> None:
     Trade(target_bytes=6000).check_size(sound)
     Trade(target_bytes=300).check_size(None)
     for target, heard, words in ((5000, sound, "give a larger size, or encode with less sound"), (5, None, "larger")):
-        with pytest.raises(TrainingError, match=f"index and sound alone take .* more than {target:,}; .*{words}"):
+        with pytest.raises(TrainingError, match=f"leaves {target:,} bytes .* index and sound alone take .*{words}"):
             Trade(target_bytes=target).check_size(heard)
 
 
