@@ -10,7 +10,6 @@
 import argparse
 import math
 import sys
-from pathlib import Path
 
 from kpc.encoder.poses.document import write_document
 from kpc.encoder.poses.find import Found, find_poses
@@ -38,9 +37,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     cli.add_version_option(parser)
     parser.add_argument(
-        "folder", type=Path, metavar="videos", help="a folder of videos, of folders of frames, or of photographs"
+        "folder",
+        type=cli.named_path,
+        metavar="videos",
+        help="a folder of videos, of folders of frames, or of photographs",
     )
-    parser.add_argument("-o", "--output", type=Path, metavar="JSON", help="default: transforms.json in the folder")
+    parser.add_argument(
+        "-o", "--output", type=cli.named_path, metavar="JSON", help="default: transforms.json in the folder"
+    )
     add_pose_options(parser)
     return parser
 

@@ -23,7 +23,7 @@ def read_dataset(options: Options) -> Dataset:
         file = options.work_dir / POSES / "transforms.json"
         if not file.exists():
             _find_poses(options, file)
-        elif options.resume:
+        else:
             print(f"cameras: those found before, {file}", file=sys.stderr)
         is_own = (file.parent / "images").is_dir()  # the frames of a moving camera lie beside the document
         root, transforms = (file.parent, None) if is_own else (root, file)

@@ -44,7 +44,10 @@ def leaving_nothing(work: Path) -> Iterator[None]:
         yield
     finally:
         for leftover in set(work.glob("*")) - before:
-            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink(missing_ok=True)
+            if leftover.is_dir():
+                shutil.rmtree(leftover)
+            else:
+                leftover.unlink(missing_ok=True)
         remove_if_empty(work)
 
 

@@ -16,7 +16,7 @@ from kpc.encoder.poses.survey import Survey, frame_count, greys, survey
 from kpc.encoder.poses.sync import UNKNOWN, Clock, synchronise
 from kpc.encoder.poses.wishes import Wishes
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.images import read_image
+from kpc.format.common.images import image_info, read_image
 from kpc.format.common.progress import progress
 
 # Attempts at a still rig: features in each picture, and instants at which what moves is matched.
@@ -129,17 +129,17 @@ def _find_photographs(root: Path, footage: tuple[Footage, ...]) -> Found:
         for number, one in enumerate(footage):
             yield Picture(number, 0, grey_of(read_image(one.files[0], upright=True)), None)
 
-    shapes = [picture.grey.shape for picture in pictures()]
+    sizes = [image_info(one.files[0]).displayed_size for one in footage]
     features = FEATURES_OF_MANY if len(footage) > MANY else ATTEMPTS[0][0]
-    structure = reconstruct(pictures(), [one.name for one in footage], _lenses(shapes), features)
+    structure = reconstruct(pictures(), [one.name for one in footage], _lenses(sizes), features)
     clocks = (UNKNOWN,) * len(footage)
     return Found("photographs", footage, clocks, tuple(one.name for one in footage), structure, False)
 
 
-def _lenses(shapes: Sequence[tuple[int, ...]]) -> list[int]:
+def _lenses(sizes: Sequence[tuple[int, ...]]) -> list[int]:
     """Return the number of each view's lens, to begin with: views of one size share it."""
-    distinct = list(dict.fromkeys(shapes))
-    return [distinct.index(shape) for shape in shapes]
+    distinct = list(dict.fromkeys(sizes))
+    return [distinct.index(size) for size in sizes]
 
 
 def _check(root: Path, found: Found, require_all: bool) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from kpc.encoder.datasets.video import read_video
 from kpc.encoder.poses.footage import Footage
-from kpc.encoder.poses.survey import LUMA, Survey
+from kpc.encoder.poses.survey import Survey, luma
 from kpc.encoder.poses.sync import Clock
 from kpc.format.common.images import read_image
 
@@ -78,4 +78,4 @@ def _frames(footage: Footage, numbers: list[int]) -> Iterator[tuple[int, np.ndar
 
 def grey_of(picture: np.ndarray) -> np.ndarray:
     """Return the luma of a picture, (H, W) uint8."""
-    return (picture[..., :3].astype(np.float32) @ LUMA).round().astype(np.uint8)
+    return luma(picture).round().astype(np.uint8)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kpc.encoder.datasets.capture import opengl_pose
 from kpc.encoder.poses.instants import Picture
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.progress import Progress
@@ -181,12 +182,10 @@ def _read(folder: Path) -> Structure:
     arrays = np.load(folder / "result.npz")
     views = {}
     for number, view in found["views"].items():
-        camera_from_world = np.vstack([np.array(view["camera_from_world"]), [0, 0, 0, 1]])
-        camera_to_world = np.linalg.inv(camera_from_world)
-        camera_to_world[:3, 1:3] *= -1  # OpenCV's camera looks along z with y down
+        camera_from_world = np.array(view["camera_from_world"])  # (3, 4)
         lens = view["parameters"]
         views[int(number)] = PlacedView(
-            camera_to_world,
+            opengl_pose(camera_from_world[:, :3], camera_from_world[:, 3]),
             (lens.get("fx", lens.get("f")), lens.get("fy", lens.get("f")), lens["cx"], lens["cy"]),
             (lens.get("k1", lens.get("k", 0.0)), lens.get("k2", 0.0), lens.get("p1", 0.0), lens.get("p2", 0.0)),
             view["points"],

@@ -53,8 +53,13 @@ def greys(footage: Footage) -> Iterator[np.ndarray]:
         if footage.video is not None
         else (read_image(file, upright=True) for file in footage.files)
     )
-    for frame in frames:
-        yield frame[..., :3].astype(np.float32) @ LUMA
+    yield from map(luma, frames)
+
+
+def luma(picture: np.ndarray) -> np.ndarray:
+    """Return the luma of a picture, (H, W) float32 in [0, 255]."""
+    found: np.ndarray = picture[..., :3].astype(np.float32) @ LUMA
+    return found
 
 
 def frame_count(footage: Footage) -> int:

@@ -6,12 +6,11 @@ Each table but `metadata` is a camera: `name`, `size`, `matrix`, `distortions`, 
 Sources: `aniposelib/cameras.py` in https://github.com/lambdaloop/aniposelib, https://anipose.readthedocs.io
 """
 
-import sys
 from pathlib import Path
 from typing import Any
 
-from kpc.encoder.datasets.capture import Capture, first_names, natural_key, printable
-from kpc.encoder.datasets.layouts.calibration import RigCamera
+from kpc.encoder.datasets.capture import Capture, natural_key, printable
+from kpc.encoder.datasets.layouts.calibration import RigCamera, first_calibration
 from kpc.encoder.datasets.layouts.caliscope import toml_camera
 from kpc.encoder.datasets.layouts.documents import read_toml
 from kpc.encoder.datasets.layouts.rig_media import read_rig
@@ -35,9 +34,7 @@ def read(path: Path, holdout: str | None) -> Capture:
     Raises:
         DatasetError, MediaError: the calibration or a file cannot be used.
     """
-    file, *others = _files(path)
-    if others:
-        print(f"{path}: {file.name} is read; {first_names([o.name for o in others])} are not", file=sys.stderr)
+    file = first_calibration(path, _files(path))
     tables = {key: table for key, table in read_toml(file).items() if key != "metadata" and isinstance(table, dict)}
     if not tables:
         raise DatasetError(f"{file}: has no cameras; calibrate the rig first")

@@ -8,13 +8,15 @@ Source: https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html
 
 import math
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import Lens, opengl_pose, printable
+from kpc.encoder.datasets.capture import Lens, first_names, opengl_pose, printable
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.camera_checks import NO_DISTORTION, NUMBER_LIMIT, Distortion
 from kpc.format.scene.rotations import rotation_of
@@ -48,6 +50,14 @@ class RigCamera:
     where: str
     lens: Lens
     camera_to_world: np.ndarray
+
+
+def first_calibration(root: Path, files: Sequence[Path]) -> Path:
+    """Return the first of a folder's calibrations, and name the others in one line."""
+    chosen, *others = files
+    if others:
+        print(f"{root}: {chosen.name} is read; {first_names([o.name for o in others])} are not", file=sys.stderr)
+    return chosen
 
 
 def opencv_camera(

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from kpc.encoder.datasets.capture import Capture, first_names, natural_key, printable
-from kpc.encoder.datasets.layouts.calibration import RigCamera, opencv_camera, size_of
+from kpc.encoder.datasets.layouts.calibration import RigCamera, first_calibration, opencv_camera, size_of
 from kpc.encoder.datasets.layouts.documents import MAX_BYTES, read_json
 from kpc.encoder.datasets.layouts.rig_media import read_rig
 from kpc.format.common.errors import DatasetError
@@ -41,9 +41,7 @@ def read(path: Path, holdout: str | None) -> Capture:
     Raises:
         DatasetError, MediaError: the calibration or a file cannot be used.
     """
-    file, *others = _files(path)
-    if others:
-        print(f"{path}: {file.name} is read; {first_names([o.name for o in others])} are not", file=sys.stderr)
+    file = first_calibration(path, _files(path))
     document = read_json(file, MAX_BYTES)
     listed = document.get("cameras") if isinstance(document, dict) else None
     if not (isinstance(listed, list) and listed and all(isinstance(keys, dict) for keys in listed)):

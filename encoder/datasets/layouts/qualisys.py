@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from kpc.encoder.datasets.capture import Capture, first_names, natural_key, printable
-from kpc.encoder.datasets.layouts.calibration import PIXEL_CENTRE, RigCamera, numbers, opencv_camera
+from kpc.encoder.datasets.layouts.calibration import PIXEL_CENTRE, RigCamera, first_calibration, numbers, opencv_camera
 from kpc.encoder.datasets.layouts.documents import read_xml
 from kpc.encoder.datasets.layouts.rig_media import read_rig
 from kpc.format.common.errors import DatasetError
@@ -44,9 +44,7 @@ def read(path: Path, holdout: str | None) -> Capture:
     Raises:
         DatasetError, MediaError: the calibration or a file cannot be used.
     """
-    file, *others = _files(path)
-    if others:
-        print(f"{path}: {file.name} is read; {first_names([o.name for o in others])} are not", file=sys.stderr)
+    file = first_calibration(path, _files(path))
     elements = list(read_xml(file).iter("camera"))
     if not elements:
         raise DatasetError(f"{file}: lists no cameras; export it from Qualisys Track Manager anew")
