@@ -25,7 +25,9 @@ vec3 linear_light(vec3 x) {
 
 // The mean of the four rays around a place whose own limit is `limit`: those that could see as far count most, so that
 // edges of what hides the picture stay sharp where rays are few. z: sum of weight times distance.
-void mixed(sampler2D rays, sampler2D ray_sums, vec2 at, float limit, float share, inout vec4 colour, inout float depth) {
+void mixed(
+    sampler2D rays, sampler2D ray_sums, vec2 at, float limit, float share, inout vec4 colour, inout float depth
+) {
     vec2 size = vec2(textureSize(rays, 0)), position = at * size - 0.5, f = fract(position);
     ivec2 last = ivec2(size) - 1, first = ivec2(floor(position));
     vec4 sum = vec4(0.0);

@@ -1,5 +1,5 @@
 /**
- * Times pages over a slow line: `node loading_bench.mjs CHROMIUM FOLDER SECONDS PAGE ...`, each in a browser of its own.
+ * Times pages over a slow line: `node loading_bench.mjs CHROMIUM FOLDER SECONDS PAGE ...`, each in its own browser.
  *
  * A page calls `firstPicture()` once it shows something. Writes a list as JSON: milliseconds from navigation to that,
  * the longest task of the page's main thread until then, by the clock and by its processor time, bytes fetched, and

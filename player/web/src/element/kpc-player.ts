@@ -339,7 +339,7 @@ export class KpcPlayer extends AudibleElement implements Model {
         progress: () => this.#progressed(),
         viewChanged: () => this.#emit('camera-change'),
         lost: (isLost) => this.#ui.notify(isLost ? CONTEXT_LOST : '', isLost),
-        told: (message) => this.#ui.notify(message),
+        notified: (message) => this.#ui.notify(message),
         failed: (error) => this.#failed(error),
         frame: () => this.#refresh(),
       },

@@ -43,7 +43,7 @@ export interface SessionEvents {
   lost(isLost: boolean): void;
   failed(error: unknown): void;
   /** There is something to tell the user, who can go on. */
-  told(message: string): void;
+  notified(message: string): void;
   /** A frame is over. */
   frame(): void;
 }
@@ -94,7 +94,7 @@ export class Session {
       const clip = await Clip.open(src, { memory, signal: this.#opening.signal, pool, position });
       if (this.#isClosed) return clip.close();
       this.clip = clip;
-      this.sound = new SessionSound(clip, clock, volume, (message) => this.#events.told(message));
+      this.sound = new SessionSound(clip, clock, volume, (message) => this.#events.notified(message));
       const { aabb } = clip.scenes[0].head;
       const { up, view_limits: limits, opening } = clip.metadata;
       const rig = new Rig(clip.cameras, aabb, up);

@@ -2,7 +2,7 @@
  * Playing the sound of a clip in step with its pictures: the clock of the clip follows the device's.
  *
  * In each frame the caller asks `advance` by how much the clip is to go on, and passes its position to `follow`. Sound
- * is decoded in blocks ahead of the playhead and scheduled on the device's clock, one block after the other. A sound that
+ * is decoded in blocks ahead of the playhead and scheduled on the device's clock, one after the other. A sound that
  * is elsewhere than the clip, after a seek or a pause, begins anew there. No page, no timers.
  */
 
@@ -12,7 +12,7 @@ import { SAMPLE_RATE } from '../container/sound.js';
 const FOLLOW_S = 0.5;
 /** A sound that is farther than this from the clip begins anew at the clip's time, seconds. */
 const APART_S = 0.2;
-/** A sound that begins is late against the clip by so many seconds at most; what the device's latency exceeds is cut. */
+/** A sound begins late against the clip by so many seconds at most; what the device's latency exceeds is cut. */
 const LATE_S = 0.1;
 /** Seconds of a block, and how many are scheduled ahead. */
 const BLOCK_S = 1;

@@ -9,7 +9,7 @@ import { moved, type Placement, placedAround, poseInScene, turned } from './plac
 const MODE = 'immersive-vr';
 /** Frames a second of headsets that do not say theirs. */
 const USUAL_FPS = 72;
-/** What a thumbstick does when pushed all the way, radians and metres a second; less than a share of that is nothing. */
+/** What a thumbstick does when pushed all the way, radians and metres a second; a small share of it is nothing. */
 const [TURN_SPEED, MOVE_SPEED, REST] = [1.5, 1, 0.15];
 /** The button of the grip in the standard layout of controllers. */
 const GRIP = 1;
