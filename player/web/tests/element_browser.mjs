@@ -516,6 +516,50 @@ scenario('says that there is no WebGL2', async () => {
   await close(page);
 });
 
+scenario('draws with less memory where the card has little, and says so where it has none', async () => {
+  const page = await open(TAG, {
+    before: (it) =>
+      it.addInitScript(() => {
+        const { prototype } = WebGL2RenderingContext;
+        const { texStorage2D, getError } = prototype;
+        const sizes = new Map([
+          [prototype.RGBA32F, 16],
+          [prototype.RGBA16F, 8],
+        ]);
+        Object.assign(globalThis, { limit: Number.POSITIVE_INFINITY, largest: 0, refused: 0 });
+        prototype.texStorage2D = function (target, levels, format, width, height) {
+          const bytes = (sizes.get(format) ?? 4) * width * height;
+          globalThis.largest = Math.max(globalThis.largest, bytes);
+          if (bytes < globalThis.limit) texStorage2D.call(this, target, levels, format, width, height);
+          else this.isFull = ++globalThis.refused > 0;
+        };
+        prototype.getError = function () {
+          const error = this.isFull ? this.OUT_OF_MEMORY : getError.call(this);
+          this.isFull = false;
+          return error;
+        };
+      }),
+  });
+  const reload = (limit) =>
+    player(
+      page,
+      (it, limit) => {
+        globalThis.limit = limit;
+        it.src = `scene.kpc?${limit}`;
+      },
+      limit,
+    );
+  await shown(page);
+  await reload(await page.evaluate(() => globalThis.largest / 2));
+  await shown(page);
+  await player(page, (it) => it.toBlob());
+  assert.equal(await player(page, (it) => it.error), null);
+  assert.ok((await page.evaluate(() => globalThis.refused)) > 0);
+  await reload(0);
+  await until(page, (it) => it.error?.code === 'budget');
+  await close(page);
+});
+
 scenario('plays from servers that are slow, cut files short, know no ranges, compress and redirect', async () => {
   const page = await open('<kpc-player quality="fastest" muted></kpc-player>');
   for (const fault of ['slow', 'cut', 'whole', 'packed', 'moved']) {

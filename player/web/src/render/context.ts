@@ -14,7 +14,7 @@ const ATTRIBUTES = {
 export class RenderError extends KpcError {
   override name = 'RenderError';
 
-  constructor(message: string, code: 'no-webgl' | 'graphics' = 'graphics') {
+  constructor(message: string, code: 'no-webgl' | 'graphics' | 'budget' = 'graphics') {
     super(message, code);
   }
 }

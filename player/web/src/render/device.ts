@@ -69,7 +69,10 @@ export class Device {
   readonly isSoftware: boolean;
   /** How planes are kept: cards look up float16 at twice the rate of float32, SwiftShader at two thirds. */
   readonly planeFormat: 'rgba16f' | 'rgba32f';
+  /** Whether textures are to take little memory, since there was not enough for the usual ones. */
+  readonly isSparing: boolean;
   #objects = 0;
+  #hasNewTextures = false;
   readonly #vertices: WebGLVertexArrayObject;
   /** Until when programs may be taken in this frame: each waits a little for the card. */
   takesUntil = 0;
@@ -78,18 +81,20 @@ export class Device {
 
   constructor(
     readonly gl: WebGL2RenderingContext,
-    { halfFloat = false }: { halfFloat?: boolean } = {},
+    { halfFloat = false, isSparing = false }: { halfFloat?: boolean; isSparing?: boolean } = {},
   ) {
     const drawsFloat32 = gl.getExtension('EXT_color_buffer_float') !== null;
     if (!drawsFloat32 && gl.getExtension('EXT_color_buffer_half_float') === null) {
       throw new RenderError('WebGL2 of this browser cannot draw to textures of float numbers; use another', 'no-webgl');
     }
+    this.isSparing = isSparing;
     this.drawsFloat32 = drawsFloat32 && !halfFloat;
     this.filtersFloat32 = gl.getExtension('OES_texture_float_linear') !== null && !halfFloat;
     const info = gl.getExtension('WEBGL_debug_renderer_info');
     this.name = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
     this.isSoftware = SOFTWARE.test(this.name);
-    this.planeFormat = this.isSoftware && this.filtersFloat32 && this.drawsFloat32 ? 'rgba32f' : 'rgba16f';
+    const isFloat32Fast = this.isSoftware && this.filtersFloat32 && this.drawsFloat32;
+    this.planeFormat = isFloat32Fast && !isSparing ? 'rgba32f' : 'rgba16f';
     this.#parallel = gl.getExtension('KHR_parallel_shader_compile');
     this.maxTextureSize = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.maxVolumeSize = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
@@ -104,6 +109,7 @@ export class Device {
   texture(format: Format, size: readonly number[], isFiltered: boolean): Texture {
     const { gl } = this;
     const handle = this.#made(gl.createTexture());
+    this.#hasNewTextures = true;
     const target = size.length === 3 ? gl.TEXTURE_3D : gl.TEXTURE_2D;
     gl.bindTexture(target, handle);
     const [width, height, depth] = size;
@@ -117,6 +123,22 @@ export class Device {
       gl.texParameteri(target, side, gl.CLAMP_TO_EDGE);
     }
     return { handle, format, size };
+  }
+
+  /**
+   * Return whether there was no memory for a texture that was made since this was last asked, or for a framebuffer.
+   * Ask while the card is idle, for which this waits.
+   */
+  lacksMemory(): boolean {
+    const { gl } = this;
+    if (!this.#hasNewTextures) return false;
+    this.#hasNewTextures = false;
+    let isLacking = false;
+    for (let error = gl.getError(); error !== gl.NO_ERROR; error = gl.getError()) {
+      if (error === gl.CONTEXT_LOST_WEBGL) return false;
+      isLacking ||= error === gl.OUT_OF_MEMORY;
+    }
+    return isLacking;
   }
 
   /** Replace a part of a texture, all of it or the rectangle of `size` texels at (x, y); Uint16 are halves. */

@@ -37,6 +37,7 @@ interface Parts {
 export class DrawnScene {
   readonly source: SceneSource;
   #parts: Parts | null = null;
+  #wasMade = false;
 
   constructor(source: SceneSource) {
     this.source = source;
@@ -63,7 +64,8 @@ export class DrawnScene {
   /** Make what drawing needs on a device, unless it is there. */
   #on(device: Device): Parts {
     if (this.#parts?.device === device) return this.#parts;
-    if (this.#parts !== null) this.source.restore(); // what was made for a device before went with it
+    if (this.#wasMade) this.source.restore(); // what was made for a device before went with it
+    this.#wasMade = true;
     const textures = new SceneTextures(device, this.source);
     this.#parts = { device, textures, programs: new Programs(device, textures), folded: null };
     return this.#parts;

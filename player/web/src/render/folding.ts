@@ -28,10 +28,12 @@ export class FoldedPlanes {
   ) {
     const { device, scene } = textures;
     const finer = new Layout(scene, UPSAMPLING);
-    this.layout = Math.max(finer.width, finer.height) <= device.maxTextureSize ? finer : textures.layout;
+    const fits = Math.max(finer.width, finer.height) <= device.maxTextureSize && !device.isSparing;
+    this.layout = fits ? finer : textures.layout;
     const size = [this.layout.width, this.layout.height];
+    const isFloat32 = device.drawsFloat32 && !device.isSparing;
     this.#device = device;
-    this.#upsampled = device.texture(device.drawsFloat32 ? 'rgba32f' : 'rgba16f', size, false);
+    this.#upsampled = device.texture(isFloat32 ? 'rgba32f' : 'rgba16f', size, false);
     this.#rows = device.texture('rgba32f', [rowWidth(scene, this.layout.upsampling), this.layout.lineCount], false);
     this.#planes = device.texture(device.planeFormat, size, true);
     this.#upsampleInto = device.framebuffer([this.#upsampled]);

@@ -15,7 +15,7 @@ import { Merging, type Projection } from './merging.js';
 import { Pace, type Setting } from './pace.js';
 import { type Keeping, type Moment, type Picture, PictureJob, type ShownPart, type View } from './picture_job.js';
 import { Presentation, type Screen } from './presentation.js';
-import { LEVELS, type Level } from './quality.js';
+import { LEVEL_NAMES, LEVELS, type Level } from './quality.js';
 import type { SceneSource } from './scene_source.js';
 import { Timer } from './timer.js';
 
@@ -62,6 +62,8 @@ export interface RendererOptions {
 
 /** What is drawn once all stands still. */
 const STILL: Setting = { level: 'fine', scale: 1 };
+/** The finest that is drawn where memory is short: fine levels march many rays for a pixel. */
+const SPARING: Setting = { level: 'fast', scale: 1 };
 /** Seconds that a part of a picture may take, so that the page stays alive and drivers do not think that all hangs. */
 const MOST_SECONDS = 0.25;
 /** Seconds for a ray, until it is known: of a card, and of a processor in its place. */
@@ -181,7 +183,7 @@ export class Renderer {
     const { level = 'auto' } = options;
     const isAuto = level === 'auto';
     const wanted = this.#wanted(camera, moments, options);
-    if (this.isLost || this.#timer.isBusy) return this.#state(wanted, false);
+    if (this.isLost || this.#timer.isBusy || this.#sparesMemory()) return this.#state(wanted, false);
     for (const scene of this.#scenes) scene.upload(this.#device);
     const view = viewOf(camera, moments, options);
     const versions = moments.map(({ scene }) => scene.source.version).join();
@@ -190,14 +192,14 @@ export class Renderer {
     if (this.#job?.role === STILL_ROLE && !isSame(this.#job.view, view)) this.#job = null;
     if (this.#job === null) {
       const isSharp =
-        isShown && (isAuto ? this.#shown?.setting === STILL : isSameSetting(this.#shown?.setting, wanted));
+        isShown && (isAuto ? this.#shown?.setting === this.#still : isSameSetting(this.#shown?.setting, wanted));
       if (isSharp) {
         if (options.screen) this.present(options.screen);
         return this.#state(wanted, true);
       }
       // What was sharp stays so while more planes arrive.
-      const sharpens = isAuto && (isShown || (isStill && this.#shown?.setting === STILL));
-      const setting = sharpens ? STILL : wanted;
+      const sharpens = isAuto && (isShown || (isStill && this.#shown?.setting === this.#still));
+      const setting = sharpens ? this.#still : wanted;
       if (!this.#isReady(view, setting)) return this.#state(wanted, false);
       this.#job = this.#newJob(view, setting);
       this.#job.versions = versions;
@@ -214,7 +216,7 @@ export class Renderer {
     const { level = 'auto' } = options;
     const [{ camera, projection }] = frames;
     const wanted = this.#wanted(camera, moments, options);
-    if (this.isLost) return this.#state(wanted, false);
+    if (this.isLost || (!this.#timer.isBusy && this.#sparesMemory())) return this.#state(wanted, false);
     for (const scene of this.#scenes) scene.upload(this.#device);
     const background = projection ? [0, 0, 0] : options.background;
     const views = frames.map(({ camera }) => viewOf(camera, moments, { ...options, background }));
@@ -287,16 +289,20 @@ export class Renderer {
     this.#isDisposed = true;
     this.gl.canvas.removeEventListener('webglcontextlost', this.#onLost);
     this.gl.canvas.removeEventListener('webglcontextrestored', this.#onRestored);
-    for (const scene of this.#scenes) scene.release();
+    this.#releaseAll();
     this.#scenes.clear();
-    this.#timer.dispose();
-    this.#presentation.release();
-    this.#merging?.release();
-    this.#device.dispose();
+  }
+
+  /** What is drawn once all stands still. */
+  get #still(): Setting {
+    return this.#device.isSparing ? SPARING : STILL;
   }
 
   #wanted(camera: Camera, moments: readonly Moment[], { level = 'auto' }: DrawOptions): Setting {
-    return level === 'auto' ? this.pace.setting(texelsPerPixel(moments[0].scene.source, camera)) : settingOf(level);
+    const { source } = moments[0].scene;
+    const wanted = level === 'auto' ? this.pace.setting(texelsPerPixel(source, camera)) : settingOf(level);
+    const isTooFine = LEVEL_NAMES.indexOf(wanted.level) > LEVEL_NAMES.indexOf(SPARING.level);
+    return this.#device.isSparing && isTooFine ? SPARING : wanted;
   }
 
   /** Whether no compiler keeps a picture waiting. */
@@ -312,7 +318,7 @@ export class Renderer {
 
   #newJob(view: View, setting: Setting): PictureJob {
     const keeping = (role: string): Keeping => ({ role, isExact: setting.level === 'reference' });
-    if (setting === STILL) return new PictureJob(view, setting, this.#presentation, keeping(STILL_ROLE));
+    if (setting === this.#still) return new PictureJob(view, setting, this.#presentation, keeping(STILL_ROLE));
     const role = this.#shown?.role === LIVE[0] ? LIVE[1] : LIVE[0];
     return new PictureJob(view, setting, this.#presentation, keeping(role));
   }
@@ -363,13 +369,40 @@ export class Renderer {
   };
 
   readonly #onRestored = (): void => {
-    this.#device = new Device(this.gl, this.#options);
+    this.#beginAnew(this.#device.isSparing);
+    this.#options.onRestored?.();
+  };
+
+  /** Forget all that is on the card, and make it again as it is needed. */
+  #beginAnew(isSparing: boolean): void {
+    this.#device = new Device(this.gl, { ...this.#options, isSparing });
     this.#presentation = new Presentation(this.#device);
     this.#merging = null;
     this.#timer = new Timer(this.gl, this.isSoftware);
     this.#shown = this.#job = null;
-    this.#options.onRestored?.();
-  };
+  }
+
+  /**
+   * If the card had no memory for a texture, begin anew with smaller ones.
+   * @returns whether that was so; there is nothing to draw yet, then.
+   * @throws RenderError: they were small already.
+   */
+  #sparesMemory(): boolean {
+    if (!this.#device.lacksMemory()) return false;
+    const { isSparing, name } = this.#device;
+    this.#releaseAll();
+    this.#beginAnew(true);
+    if (isSparing) throw new RenderError(`${name} has no memory for the textures of the scene`, 'budget');
+    return true;
+  }
+
+  #releaseAll(): void {
+    for (const scene of this.#scenes) scene.release();
+    this.#timer.dispose();
+    this.#presentation.release();
+    this.#merging?.release();
+    this.#device.dispose();
+  }
 }
 
 function viewOf(camera: Camera, moments: readonly Moment[], options: DrawOptions): View {
