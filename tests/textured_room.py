@@ -14,6 +14,8 @@ SIZE = WIDTH, HEIGHT = 256, 192
 FOCAL = 240.0
 FPS = 20.0
 
+PERIOD = 768  # texels, at 128 a metre: more than is seen, since repeated patterns match wrongly
+
 
 @dataclass(frozen=True)
 class RigCamera:
@@ -48,10 +50,17 @@ def write_films(folder: Path, cameras: list[RigCamera], frames: int) -> None:
         ffmpeg(*source, "-c:v", "libx264", "-crf", 8, "-pix_fmt", "yuv420p", folder / f"{camera.name}.mp4", frames=raw)
 
 
+def write_pictures(folder: Path, cameras: list[RigCamera]) -> None:
+    """Write what each camera sees where nothing moves, as NAME.png."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for camera in cameras:
+        Image.fromarray(_walls(camera).astype(np.uint8)).save(folder / f"{camera.name}.png")
+
+
 @functools.cache
 def _texture(seed: int) -> np.ndarray:
-    """Return (256, 256, 3) uint8 blobs of several sizes."""
-    noise = np.random.default_rng(seed).standard_normal((256, 256, 3))
+    """Return (PERIOD, PERIOD, 3) uint8 blobs of several sizes."""
+    noise = np.random.default_rng(seed).standard_normal((PERIOD, PERIOD, 3))
     blobs = sum(4 * ndimage.gaussian_filter(noise, (s, s, 0)) * s for s in (1.5, 3.0, 6.0))
     return np.clip(128 + 35 * blobs, 0, 255).astype(np.uint8)
 
@@ -69,7 +78,7 @@ def _walls(camera: RigCamera) -> np.ndarray:
             depth = (level - centre[axis]) / rays[..., axis]
         hit = (depth > 0) & (depth < nearest)
         place = (centre + np.where(hit, depth, 0.0)[..., None] * rays)[..., along] * 128
-        column, row = np.moveaxis(place.astype(int) % 256, -1, 0)
+        column, row = np.moveaxis(place.astype(int) % PERIOD, -1, 0)
         colours = _texture(seed)[row, column]
         picture[hit], nearest[hit] = colours[hit], depth[hit]
     return picture

@@ -12,12 +12,14 @@ too; all matches of two views then count together.
 import json
 import sys
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
+
+from kpc.encoder.poses.matching import alike_pairs, match_pairs, strongest
 
 # A camera model with more parameters is taken if it lowers n log(sum of squared errors) by so many times log(n) for
 # each: the Bayesian information criterion has 1, but errors of one point in many views are not independent.
@@ -25,19 +27,26 @@ EVIDENCE = 4.0
 # Camera models in the order in which they are tried, by their parameters beside the principal point.
 MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
+# An adjustment ends once a step lowers the cost by less than this share: COLMAP's own default takes four times as long
+# for the same result.
+TOLERANCE = 1e-6
+
 # The camera model while views are placed.
 FIRST_MODEL = "SIMPLE_RADIAL"
 
 # Views that a model has at least.
 LEAST_VIEWS = 3
+# Matches agree with a geometry to within this share of the larger side of pictures, or a pixel. COLMAP's own 4 pixels
+# are so much for large pictures; in small ones, all that a plane shows agrees with wrong geometries, too.
+VERIFIED = 0.0025
 # Mean distance in pixels between points and where they were found, below which a model of all views is believed.
 GOOD_ERROR = 1.0
 
 # Focal length by the larger side of the picture before anything is known, as COLMAP assumes it.
 FOCAL = 1.2
 
-# The largest angle between descriptors that match, in radians, and its largest ratio to the angle of the next.
-FURTHEST, RATIO = 0.7, 0.8
+# Pictures whose features are found between two lines of progress.
+BATCH = 16
 
 
 def main(folder: Path) -> None:
@@ -45,16 +54,16 @@ def main(folder: Path) -> None:
     job = json.loads((folder / "job.json").read_text())
     pycolmap.logging.minloglevel = 2
     pycolmap.set_random_seed(job["seed"])
-    pictures = list(_features(folder, job))
-    matches = _matches(job, [features for _, features in pictures])
+    pictures = _features(folder, job)
+    matches = _matches(job, pictures)
     database = folder / "views.db"
     _write_views(database, job, [keypoints for keypoints, _ in pictures], matches)
-    pycolmap.geometric_verification(database)
+    _verify(database, job)
     model = _reconstruct(folder, database, job)
     found: dict[str, Any] = {"pairs": _pairs(database), "views": {}}
     arrays: dict[str, Any] = {}
     if model is not None:
-        model = _with_best_cameras(model)
+        model = _with_best_cameras(model, job["is_rig"])
         found["views"], arrays = _views(model), _points(model)
     np.savez(folder / "result.npz", **arrays)
     (folder / "result.json").write_text(json.dumps(found))
@@ -64,65 +73,64 @@ def _say(step: str, done: int, total: int) -> None:
     print(json.dumps({"step": step, "done": done, "total": total}), flush=True)
 
 
-def _features(folder: Path, job: dict[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield for each picture the (N, 4) float32 keypoints x y scale orientation, and (N, 128) float32 descriptors of
-    length 1.
-    """
-    options = pycolmap.FeatureExtractionOptions()
-    options.sift.max_num_features = job["features"]
-    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-    for number, picture in enumerate(job["pictures"]):
-        keypoints, descriptors = extractor.extract_from_uint8_array(np.load(folder / picture["file"]))
-        places = pycolmap.keypoints_to_matrix(keypoints)
+def _features(folder: Path, job: dict[str, Any]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return for each picture (N, 6) float32 keypoints, x y and a 2 x 2 matrix, and (N, 128) uint8 descriptors."""
+    options = pycolmap.FeatureExtractionOptions(num_threads=job["threads"])
+    options.sift.max_num_features, options.sift.first_octave = job["features"], job["first_octave"]
+    file = folder / "features.db"
+    files = [picture["file"] for picture in job["pictures"]]
+    for start in range(0, len(files), BATCH):
+        pycolmap.extract_features(
+            file,
+            folder,
+            image_names=files[start : start + BATCH],
+            camera_mode=pycolmap.CameraMode.PER_IMAGE,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
+        _say("finding features", min(start + BATCH, len(files)), len(files))
+    database = pycolmap.Database.open(file)
+    found = []
+    for picture in job["pictures"]:
+        number = database.read_image_with_name(picture["file"]).image_id
+        places = np.asarray(database.read_keypoints(number), np.float32).reshape(-1, 6)
         used = np.ones(len(places), bool)
         if picture["mask"] is not None:  # (H, W) bool
             mask = np.load(folder / picture["mask"])
             x, y = (places[:, axis].astype(int).clip(0, mask.shape[1 - axis] - 1) for axis in (0, 1))
             used = mask[y, x]
-        places = places[used] * np.array([picture["scale"]] * 3 + [1], np.float32)
-        found = descriptors.data[used].astype(np.float32)
-        found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
-        _say("finding features", number + 1, len(job["pictures"]))
-        yield places, found
+        found.append((places[used] * picture["scale"], np.asarray(database.read_descriptors(number).data)[used]))
+    database.close()
+    return found
 
 
-def _matches(job: dict[str, Any], features: list[np.ndarray]) -> dict[tuple[int, int], np.ndarray]:
-    """Match the pictures of each instant and merge what belongs to the same two views.
+def _matches(job: dict[str, Any], pictures: list[tuple[np.ndarray, np.ndarray]]) -> dict[tuple[int, int], np.ndarray]:
+    """Match pictures and merge what belongs to the same two views.
 
     Returns:
         By pairs of views, (M, 2) uint32 numbers of keypoints, which count on over the pictures of a view.
     """
+    features = [descriptors for _, descriptors in pictures]
     starts = _starts(job, [len(descriptors) for descriptors in features])
     found: dict[tuple[int, int], list[np.ndarray]] = {}
-
-    def match(pair: tuple[int, int]) -> np.ndarray:
-        return _matched(features[pair[0]], features[pair[1]])
-
-    with ThreadPoolExecutor(job["threads"]) as pool:
-        for number, (pair, matched) in enumerate(zip(job["pairs"], pool.map(match, job["pairs"]), strict=True)):
-            views = tuple(job["pictures"][picture]["view"] for picture in pair)
-            found.setdefault(views, []).append(matched + np.array([starts[picture] for picture in pair], np.uint32))
-            _say("matching", number + 1, len(job["pairs"]))
+    pairs = [*map(tuple, job["pairs"]), *_alike(job, pictures)]
+    for number, (pair, matched) in enumerate(match_pairs(features, pairs, job["threads"]), 1):
+        views = tuple(job["pictures"][picture]["view"] for picture in pair)
+        found.setdefault(views, []).append(matched + np.array([starts[picture] for picture in pair], np.uint32))
+        _say("matching", number, len(pairs))
     return {views: np.concatenate(parts) for views, parts in found.items()}
 
 
-def _matched(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Return (M, 2) uint32 numbers of features that are each other's nearest, and much nearer than the second.
-
-    As in COLMAP, whose own matcher takes eight times as long on a processor: angles between descriptors at most
-    FURTHEST, and at most RATIO of that to the second nearest (Lowe, IJCV 2004, section 7.1).
-    """
-    if min(len(one), len(two)) < 2:
-        return np.zeros((0, 2), np.uint32)
-    cosines = one @ two.T  # (N, M) float32
-    nearest, back = cosines.argmax(1), cosines.argmax(0)
-    mutual = np.flatnonzero(back[nearest] == np.arange(len(one)))
-    partners = nearest[mutual]
-    first = np.arccos(np.minimum(cosines[mutual, partners], 1))
-    cosines[mutual, partners] = -1
-    others = np.maximum(cosines.max(1)[mutual], cosines.max(0)[partners])
-    good = (first <= FURTHEST) & (first <= RATIO * np.arccos(np.minimum(others, 1)))
-    return np.stack([mutual[good], partners[good]], axis=1).astype(np.uint32)
+def _alike(job: dict[str, Any], pictures: list[tuple[np.ndarray, np.ndarray]]) -> list[tuple[int, int]]:
+    """Return pairs of pictures that look alike and are not among those of the job."""
+    known = set(map(tuple, job["pairs"]))
+    candidates = [pair for pair in combinations(job["compared"], 2) if pair not in known]
+    features = [strongest(*picture) for picture in pictures]
+    counts = {}
+    for number, (pair, matched) in enumerate(match_pairs(features, candidates, job["threads"]), 1):
+        counts[pair] = len(matched)
+        _say("comparing", number, len(candidates))
+    return alike_pairs(counts, job["alike"])
 
 
 def _starts(job: dict[str, Any], counts: list[int]) -> list[int]:
@@ -161,6 +169,17 @@ def _write_views(
         if len(pairs):
             database.write_matches(one + 1, two + 1, pairs)
     database.close()
+
+
+def _verify(database: Path, job: dict[str, Any]) -> None:
+    """Find which matches of two views agree with one geometry."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = job["seed"]
+    largest = max(max(camera["size"]) for camera in job["cameras"])
+    options.ransac.max_error = max(VERIFIED * largest, 1.0)
+    pycolmap.geometric_verification(
+        database, pycolmap.GeometricVerifierOptions(num_threads=job["threads"]), two_view_geometry_options=options
+    )
 
 
 def _pairs(file: Path) -> list[tuple[int, int, int, int]]:
@@ -212,13 +231,16 @@ def _mean_error(model: pycolmap.Reconstruction) -> float:
     return float(model.compute_mean_reprojection_error())
 
 
-def _with_best_cameras(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+def _with_best_cameras(model: pycolmap.Reconstruction, is_rig: bool) -> pycolmap.Reconstruction:
     """Return the model adjusted with the cameras that its points speak for: how many parameters, shared or not."""
     best, least = model, np.inf
-    for shared in (True, False):
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.solver_options.function_tolerance = TOLERANCE
+    _say("adjusting lenses", 0, 1)
+    for shared in (True, False) if is_rig else (True,):
         for name in MODELS:
             tried = _with_cameras(model, name, shared)
-            pycolmap.bundle_adjustment(tried, pycolmap.BundleAdjustmentOptions(print_summary=False))
+            pycolmap.bundle_adjustment(tried, options)
             measure = _criterion(tried)
             if measure < least:
                 best, least = tried, measure

@@ -30,7 +30,7 @@ def write_document(found: Found, root: Path, file: Path) -> None:
     if found.is_metric:
         document["unit"] = "metre"
     if found.kind == "moving camera":
-        document |= _moving_camera(found, file.parent / IMAGES)
+        document |= _moving_camera(found, root, file.parent)
     else:
         document["frames"] = [
             frame for number in sorted(found.structure.views) for frame in _frames_of(found, number, root)
@@ -46,32 +46,36 @@ def _frames_of(found: Found, number: int, root: Path) -> list[dict[str, Any]]:
     if footage.video is None:
         times = frame_times(footage) / max(len(footage.files) - 1, 1)
         return [
-            {"file_path": image.relative_to(root).as_posix()}
-            | ({"time": float(time)} if len(footage.files) > 1 else {})
-            | camera
+            {"file_path": _relative(image, root)} | ({"time": float(time)} if len(footage.files) > 1 else {}) | camera
             for image, time in zip(footage.files, times, strict=True)
         ]
     clocks = {"time_offset": clock.offset_s} if clock.offset_s else {}
     if clock.rate != 1:
         clocks["time_rate"] = clock.rate
     size = {"w": footage.video.width, "h": footage.video.height}
-    return [{"file_path": footage.files[0].relative_to(root).as_posix()} | clocks | size | camera]
+    return [{"file_path": _relative(footage.files[0], root)} | clocks | size | camera]
 
 
-def _moving_camera(found: Found, folder: Path) -> dict[str, Any]:
-    footage = found.footage[0]
-    assert footage.video is not None
-    times, fps = footage.video.times, footage.video.fps
-    folder.mkdir(parents=True, exist_ok=True)
-    frames = []
-    pictures = enumerate(read_video(footage.files[0], footage.video))
-    for number, picture in progress(pictures, "writing frames", len(times), "frame"):
-        if number in found.structure.views:
-            image = folder / f"{found.view_names[number]}.png"
-            write_image(image, picture)
-            time = float((times[number] - times[0]) / max(times[-1] - times[0], 1e-9))
-            frames.append({"file_path": f"{IMAGES}/{image.name}", "time": time} | _camera(found, number))
-    return {"fps": float(fps), "frames": frames}
+def _moving_camera(found: Found, root: Path, folder: Path) -> dict[str, Any]:
+    """Return the frames of a moving camera: its images, or those of its video, which are written into a folder."""
+    footage, views = found.footage[0], sorted(found.structure.views)
+    times = frame_times(footage) - frame_times(footage)[0]
+    files = {number: _relative(footage.files[number], root) for number in views} if footage.video is None else {}
+    fps = {} if footage.video is None else {"fps": float(footage.video.fps)}
+    if footage.video is not None:
+        (folder / IMAGES).mkdir(parents=True, exist_ok=True)
+        pictures = enumerate(read_video(footage.files[0], footage.video))
+        for number, picture in progress(pictures, "writing frames", len(times), "frame"):
+            if number in found.structure.views:
+                files[number] = f"{IMAGES}/{found.view_names[number]}.png"
+                write_image(folder / files[number], picture)
+    last = max(float(times[-1]), 1e-9)
+    frames = [{"file_path": files[n], "time": float(times[n]) / last} | _camera(found, n) for n in views]
+    return fps | {"frames": frames}
+
+
+def _relative(file: Path, root: Path) -> str:
+    return file.relative_to(root).as_posix()
 
 
 def _camera(found: Found, number: int) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """From bare footage to cameras and clocks: what `kpposes` does, and `kpenc` for a folder without poses."""
 
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.poses.footage import Footage, find_footage
 from kpc.encoder.poses.instants import Picture, grey_of, moving_pictures, still_pictures
 from kpc.encoder.poses.orientation import extent, oriented
-from kpc.encoder.poses.structure import PlacedView, Structure, reconstruct
+from kpc.encoder.poses.structure import MANY, Pairing, PlacedView, Structure, reconstruct
 from kpc.encoder.poses.survey import Survey, frame_count, greys, survey
 from kpc.encoder.poses.sync import UNKNOWN, Clock, synchronise
 from kpc.encoder.poses.wishes import Wishes
@@ -21,10 +22,12 @@ from kpc.format.common.progress import progress
 
 # Attempts at a still rig: features in each picture, and instants at which what moves is matched.
 ATTEMPTS = ((4096, 4), (8192, 10))
-# Features in each picture of a moving camera or a collection, where there are more pictures than this: fewer.
-MANY, FEATURES_OF_MANY = 100, 2048
-# Pictures of one moving camera are matched with so many before and after them, and some further away.
-NEIGHBOURS = 8
+# Features in each picture of a moving camera or a collection of more than MANY.
+FEATURES_OF_MANY = 2048
+# Pictures of one moving camera are matched with those so many frames away, and with some that look alike.
+FRAMES = Pairing((1, 2, 3, 4, 6, 8, 12, 16, 24, 32), alike=5, every=3)
+# Photographs are matched with those that look alike, and with the next ones, which mostly were taken there, too.
+PHOTOGRAPHS = Pairing((1, 2), alike=20)
 # A scene cannot be made from fewer cameras.
 LEAST_CAMERAS = 3
 # Pairs of cameras are named as matching if so many features agree.
@@ -60,8 +63,15 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
         MediaError: a file cannot be read.
     """
     footage = find_footage(root)
-    if all(frame_count(one) == 1 for one in footage):
-        print(f"{root}: taken for photographs of one scene ({len(footage)} images)", file=sys.stderr)
+    images = [one.files[0] for one in footage if frame_count(one) == 1]
+    if len(images) == len(footage) and wishes.rig == "moving":
+        print(f"{root}: taken for the frames of a camera that moves (as --rig says)", file=sys.stderr)
+        found = _find_moving_camera(
+            root, Footage(root.name, tuple(file for one in footage for file in one.files), None)
+        )
+    elif all(frame_count(one) == 1 for one in footage):
+        frames = "; --rig moving for the frames of a clip" if _is_numbered(footage) else ""
+        print(f"{root}: taken for photographs of one scene ({len(footage)} images{frames})", file=sys.stderr)
         found = _find_photographs(root, footage)
     else:
         surveys = [survey(one) for one in progress(footage, "looking at what moves", unit="camera")]
@@ -79,6 +89,12 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
             )
     _check(root, found, wishes.require_all)
     return _scaled(root, found, wishes)
+
+
+def _is_numbered(footage: Sequence[Footage]) -> bool:
+    """Return whether images are numbered without gaps."""
+    numbers = [re.search(r"\d+(?=\D*$)", one.name) for one in footage]
+    return all(numbers) and len(footage) == 1 + int(numbers[-1][0]) - int(numbers[0][0])
 
 
 def _what(footage: Sequence[Footage], surveys: Sequence[Survey], is_still: bool, rig: str) -> str:
@@ -118,9 +134,7 @@ def _find_moving_camera(root: Path, footage: Footage) -> Found:
     count = frame_count(footage)
     names = [f"{number:06d}" for number in range(count)]
     pictures = (Picture(number, 0, grey.round().astype(np.uint8), None) for number, grey in enumerate(greys(footage)))
-    structure = reconstruct(
-        pictures, names, [0] * count, FEATURES_OF_MANY if count > MANY else ATTEMPTS[0][0], NEIGHBOURS
-    )
+    structure = reconstruct(pictures, names, [0] * count, FEATURES_OF_MANY if count > MANY else ATTEMPTS[0][0], FRAMES)
     return Found("moving camera", (footage,), (UNKNOWN,), tuple(names), structure, False)
 
 
@@ -131,7 +145,7 @@ def _find_photographs(root: Path, footage: tuple[Footage, ...]) -> Found:
 
     sizes = [image_info(one.files[0]).displayed_size for one in footage]
     features = FEATURES_OF_MANY if len(footage) > MANY else ATTEMPTS[0][0]
-    structure = reconstruct(pictures(), [one.name for one in footage], _lenses(sizes), features)
+    structure = reconstruct(pictures(), [one.name for one in footage], _lenses(sizes), features, PHOTOGRAPHS)
     clocks = (UNKNOWN,) * len(footage)
     return Found("photographs", footage, clocks, tuple(one.name for one in footage), structure, False)
 

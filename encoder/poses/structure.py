@@ -18,8 +18,28 @@ from kpc.format.common.progress import Progress
 
 # The larger side of pictures in which features are looked for, pixels; more are averaged down.
 LARGEST_SIDE = 1600
+# Where there are more pictures than MANY, larger than FINE_SIDE, features are not sought at twice their resolution.
+MANY, FINE_SIDE = 100, 800
 
 SEED = 0
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Which pictures are matched.
+
+    Attributes:
+        steps: those whose views' numbers differ by one of these; None for all pictures of an instant.
+        alike: besides, so many others for each picture: those that look most like it.
+        every: these are sought among pictures so many apart.
+    """
+
+    steps: tuple[int, ...] | None = None
+    alike: int = 0
+    every: int = 1
+
+
+ALL = Pairing()
 
 
 @dataclass(frozen=True)
@@ -68,7 +88,7 @@ def reconstruct(
     names: Sequence[str],
     cameras: Sequence[int],
     features: int,
-    neighbours: int | None = None,
+    pairing: Pairing = ALL,
 ) -> Structure:
     """Find cameras and points.
 
@@ -77,39 +97,43 @@ def reconstruct(
         names: of the views.
         cameras: the number of each view's camera; views of one camera share its lens.
         features: at most, in each picture.
-        neighbours: match views whose numbers differ by no more than this, and a few far ones; None for all.
+        pairing: which pictures are matched.
 
     Raises:
         DatasetError: COLMAP is not installed, or it failed.
     """
     with tempfile.TemporaryDirectory(prefix="kpposes-") as name:
         folder = Path(name)
-        described, scales = [], {}
+        described, largest = [], 0
         sizes: dict[int, tuple[int, int]] = {}
         for number, picture in enumerate(pictures):
             factor = -(-max(picture.grey.shape) // LARGEST_SIDE)
-            np.save(folder / f"{number}.npy", _smaller(picture.grey, factor))
+            _write_grey(folder / f"{number}.pgm", _smaller(picture.grey, factor))
             if picture.mask is not None:
                 np.save(folder / f"{number}-mask.npy", picture.mask[::factor, ::factor])
-            scales[picture.view] = factor
+            largest = max(largest, *(size // factor for size in picture.grey.shape))
             sizes[cameras[picture.view]] = picture.grey.shape[1], picture.grey.shape[0]
             described.append(
                 {
                     "view": picture.view,
                     "instant": picture.instant,
-                    "file": f"{number}.npy",
+                    "file": f"{number}.pgm",
                     "mask": None if picture.mask is None else f"{number}-mask.npy",
                     "scale": factor,
                 }
             )
         job = {
             "seed": SEED,
+            "is_rig": pairing.steps is None,  # views of one size may differ in their lenses
             "features": features,
             "threads": os.cpu_count() or 1,
             "pictures": described,
             "views": [{"name": name, "camera": camera} for name, camera in zip(names, cameras, strict=True)],
             "cameras": [{"size": sizes[number]} for number in sorted(sizes)],
-            "pairs": _pairs(described, neighbours),
+            "first_octave": 0 if len(described) > MANY and largest > FINE_SIDE else -1,
+            "pairs": _pairs(described, pairing.steps),
+            "compared": list(range(0, len(described), pairing.every)) if pairing.alike else [],
+            "alike": pairing.alike,
         }
         (folder / "job.json").write_text(json.dumps(job))
         _run_worker(folder)
@@ -124,14 +148,18 @@ def _smaller(grey: np.ndarray, factor: int) -> np.ndarray:
     return np.asarray(blocks.mean((1, 3)).round(), np.uint8)
 
 
-def _pairs(pictures: list[dict], neighbours: int | None) -> list[tuple[int, int]]:
-    """Return the pairs of pictures to be matched: those of one instant, or near ones of a moving camera."""
+def _write_grey(file: Path, grey: np.ndarray) -> None:
+    """Write a picture, (H, W) uint8, in the portable greymap format."""
+    file.write_bytes(b"P5 %d %d 255\n" % (grey.shape[1], grey.shape[0]) + grey.tobytes())
+
+
+def _pairs(pictures: list[dict], steps: tuple[int, ...] | None) -> list[tuple[int, int]]:
+    """Return the pairs of pictures to be matched: those of one instant, or also of views so many apart."""
     found = []
     for a, one in enumerate(pictures):
         for b in range(a + 1, len(pictures)):
             two = pictures[b]
-            apart = abs(two["view"] - one["view"])
-            near = neighbours is None or apart <= neighbours or apart & (apart - 1) == 0
+            near = steps is None or abs(two["view"] - one["view"]) in steps
             if one["instant"] == two["instant"] and one["view"] != two["view"] and near:
                 found.append((a, b) if one["view"] < two["view"] else (b, a))
     return found

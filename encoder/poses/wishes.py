@@ -34,7 +34,12 @@ class Wishes:
 def add_pose_options(parser: argparse.ArgumentParser) -> None:
     """Add the options from which `wishes_from` makes wishes."""
     group = parser.add_argument_group("footage without poses")
-    group.add_argument("--rig", choices=RIGS, default=Wishes.rig, help="whether cameras move (default: %(default)s)")
+    group.add_argument(
+        "--rig",
+        choices=RIGS,
+        default=Wishes.rig,
+        help="whether cameras move; moving: images are the frames of one camera (default: %(default)s)",
+    )
     group.add_argument(
         "--sync", choices=SYNC_MODES, default=Wishes.sync, help="how videos are brought in step (default: %(default)s)"
     )

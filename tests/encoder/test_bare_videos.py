@@ -9,7 +9,7 @@ import pytest
 from kpc.encoder.datasets import load_dataset
 from kpc.encoder.poses.footage import find_footage
 from kpc.format.common.errors import DatasetError
-from textured_room import FOCAL, FPS, SIZE, rig, write_films
+from textured_room import FOCAL, FPS, SIZE, rig, write_films, write_pictures
 from videos import film
 
 pytest.importorskip("pycolmap", reason="needs pycolmap, of the extra poses")
@@ -101,6 +101,32 @@ def test_a_document_that_makes_no_sense_is_refused(room, document, tmp_path, cha
     file.write_text(json.dumps(document))
     with pytest.raises(DatasetError, match=said):
         load_dataset(room, tmp_path / "cache", progress=False, transforms=file)
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """A folder of the numbered pictures of a camera that is carried along an arc, and its poses (N, 4, 4)."""
+    folder = tmp_path_factory.mktemp("walk") / "pictures"
+    places = rig(5)
+    write_pictures(folder, places)
+    return folder, np.stack([place.pose for place in places])
+
+
+@pytest.mark.parametrize("kind", ["photographs", "moving camera"])
+def test_a_carried_camera_is_placed(walk, kind, tmp_path, capsys):
+    folder, poses = walk
+    file = tmp_path / "transforms.json"
+    options = ["--rig", "moving"] if kind == "moving camera" else []
+    assert kpposes.main([str(folder), "-o", str(file), *options]) == 0
+    said, document = capsys.readouterr().err, json.loads(file.read_text())
+    assert document["kind"] == kind
+    assert ("--rig moving for the frames of a clip" in said) == (kind == "photographs")
+    frames = document["frames"]
+    assert [frame["file_path"] for frame in frames] == [f"cam{number:02d}.png" for number in range(5)]
+    centres, angle = aligned(np.array([frame["transform_matrix"] for frame in frames]), poses)
+    assert centres < 0.01 and angle < 0.2
+    times = [frame.get("time") for frame in frames]
+    assert times == (pytest.approx(np.linspace(0, 1, 5)) if kind == "moving camera" else [None] * 5)
 
 
 def test_two_cameras_are_too_few(tmp_path, capsys):
