@@ -21,7 +21,7 @@ from kpc.format.common.text import valid_unicode
 from kpc.format.common.version import VERSION
 
 # Packages that only some extras bring, with one that does.
-EXTRAS = {"numba": "cpu", "llvmlite": "cpu", "OpenEXR": "film"}
+EXTRAS = {"numba": "cpu", "llvmlite": "cpu", "OpenEXR": "film", "distributed": "cluster", "fsspec": "cluster"}
 
 # Errors of writing where no space is left, or none that the user may take.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)

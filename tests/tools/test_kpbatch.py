@@ -1,0 +1,338 @@
+"""kpbatch: jobs that are checked as a whole, results that are made once, and workers that are killed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from distributed import Client, LocalCluster
+
+from kpc.encoder.coding.scene_writer import write as write_scene
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.common.errors import UsageError
+from kpc.tools.batch import engine, jobs, working
+from kpc.tools.batch.addresses import source_address
+from kpc.tools.batch.engine import Engine, Event
+from kpc.tools.batch.jobs import FaultyBatch, Job, Resources
+from kpc.tools.batch.store import RESULT, SCENE, Store, StoreError
+from kpc.tools.batch.tasks import ENCODE, Outcome, Task, done_before, first_tasks, tasks_of_groups
+from kpc.tools.batch.working import Place
+from kpc.tools.cli.kpbatch import main
+from scenes import tiny_scene
+
+SAMPLE = Path(__file__).parent.parent.parent / "samples" / "default.kpc"
+Report = Callable[[dict[str, float]], None]
+
+
+@pytest.fixture
+def take(tmp_path: Path) -> Path:
+    """Return a folder that stands for one with videos."""
+    folder = tmp_path / "take"
+    folder.mkdir()
+    (folder / "cam00.mp4").write_bytes(b"one")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def threads() -> Iterator[Client]:
+    """A cluster within this process."""
+    with (
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, resources={"cores": 2}
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    file = tmp_path / "jobs.toml"
+    file.write_text(text)
+    return file
+
+
+def test_a_grid_makes_a_job_of_each_combination(tmp_path: Path, take: Path) -> None:
+    text = (
+        'output = "out"\n[options]\npreset = "fast"\nseed = 3\n[grid]\nquality = [40, 70]\nseed = [0, 1]\n'
+        '[resources]\ncores = 2\nmemory = "3GB"\n'
+        '[[scene]]\nsource = "take"\n[[scene]]\nsource = "take"\nname = "long"\noptions = { group = "10s", seed = 7 }\n'
+    )
+    batch = jobs.read_jobs(write(tmp_path, text))
+    assert batch.output == str(tmp_path / "out")
+    assert [job.name for job in batch.jobs] == [
+        *("take.quality-40.seed-0", "take.quality-40.seed-1", "take.quality-70.seed-0", "take.quality-70.seed-1"),
+        *("long.quality-40", "long.quality-70"),
+    ]
+    first, last = batch.jobs[0], batch.jobs[-1]
+    assert first.options == ("--preset=fast", "--seed=0", "--quality=40") and not first.group
+    assert last.options == ("--preset=fast", "--seed=7", "--quality=70", "--group=10s") and last.group
+    assert first.source == str(take) and first.resources == Resources(2, 3_000_000_000)
+
+
+@pytest.mark.parametrize(
+    "text, fault",
+    [
+        ('colour = 1\noutput = "out"\n[[scene]]\nsource = "take"\n', "jobs.toml:1: 'colour' is not known"),
+        ('[[scene]]\nsource = "take"\n', "output names the folder"),
+        ('output = "out"\n', "there is no scene"),
+        ('output = "out"\n[[scene]]\nsource = "none"\n', "jobs.toml:3: {0}/none: no such file or folder"),
+        ('output = "out"\n[[scene]]\nname = "a"\n', "jobs.toml:2: the scene has no source"),
+        ('output = "out"\n[[scene]]\nsource = "take"\nname = "a/b"\n', "jobs.toml:4: name = 'a/b'"),
+        ('output = "out"\n[[scene]]\nsource = "take"\nsize = 1\n', "jobs.toml:4: 'size' is not known"),
+        (
+            'output = "out"\n[grid]\nquality = 40\n[[scene]]\nsource = "take"\n',
+            "jobs.toml:3: quality in the grid is",
+        ),
+        ('output = "out"\n[options]\npreset = "quick"\n[[scene]]\nsource = "take"\n', "invalid choice: 'quick'"),
+        ('output = "out"\n[options]\nwork = "w"\n[[scene]]\nsource = "take"\n', "jobs.toml:3: work: a batch sets"),
+        ('output = "out"\n[resources]\ncores = 0\n[[scene]]\nsource = "take"\n', "cores = 0 is not a whole number"),
+        ('output = "out"\n[resources]\nmemory = "much"\n[[scene]]\nsource = "take"\n', "'much' is not a size"),
+        ('output = "out"\n[[scene]]\nsource = "take"\n[[scene]]\nsource = "take"\n', "jobs.toml:4: the name 'take' is"),
+        ("output =\n", "line 1"),
+    ],
+)
+def test_a_fault_is_a_line(
+    tmp_path: Path, take: Path, capsys: pytest.CaptureFixture[str], text: str, fault: str
+) -> None:
+    assert main([str(write(tmp_path, text))]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1 and fault.format(tmp_path) in said[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_all_faults_are_found_at_once(tmp_path: Path, take: Path) -> None:
+    text = 'output = "out"\nx = 1\n[options]\npreset = "quick"\n[[scene]]\nsource = "take"\n[[scene]]\nsource = "no"\n'
+    with pytest.raises(FaultyBatch) as error:
+        jobs.read_jobs(write(tmp_path, text))
+    assert len(error.value.faults) == 3
+
+
+def test_an_address_follows_content_options_and_group(take: Path) -> None:
+    def keys(options: tuple[str, ...]) -> list[str]:
+        source_address.cache_clear()
+        job = Job("take", str(take), options, group=True)
+        return [task.key for task in (*first_tasks([job]), *tasks_of_groups(job, 2))]
+
+    before = keys(("--seed=1", "--quality=40"))
+    assert len({*before}) == 4
+    assert keys(("--quality=40", "--seed=1")) == before
+    assert not {*before} & {*keys(("--quality=50", "--seed=1"))}
+    (take / ".DS_Store").write_bytes(b"hidden")
+    assert keys(("--seed=1", "--quality=40")) == before
+    (take / "cam00.mp4").write_bytes(b"two")
+    assert not {*before} & {*keys(("--seed=1", "--quality=40"))}
+
+
+@pytest.mark.parametrize("address", ["{}", "file://{}", "memory://{}"])
+def test_a_store_holds_whole_files(tmp_path: Path, address: str) -> None:
+    store, file = Store(address.format(tmp_path / "store")), tmp_path / "file"
+    file.write_bytes(b"content")
+    store.put(file, "key/work/deep/a")
+    store.put_json({"a": 1}, "key/result.json")
+    store.copy("key/work/deep/a", "other")
+    assert store.names("*/result.json") == ["key/result.json"] and store.get_json("key/result.json") == {"a": 1}
+    assert store.get_folder("key/work", tmp_path / "back") and not store.get_folder("none", tmp_path / "none")
+    assert (tmp_path / "back/deep/a").read_bytes() == b"content" and store.exists("other")
+    with pytest.raises(StoreError, match="no such file"):
+        store.put(tmp_path / "missing", "key/b")
+    assert store.names("key/*") == ["key/result.json", "key/work"]
+    store.remove("key")
+    store.remove("key")
+    assert not store.exists("key/result.json")
+
+
+def test_a_store_of_an_unknown_kind_is_one_line() -> None:
+    with pytest.raises(StoreError, match="nonsense"):
+        Store("nonsense://place")
+
+
+def test_a_damaged_result_says_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "key").mkdir()
+    (tmp_path / "key" / RESULT).write_text("{")
+    with pytest.raises(StoreError, match="delete it"):
+        done_before(Store(str(tmp_path)))
+
+
+def task(number: int = 0, before: tuple[str, ...] = (), **more: Any) -> Task:
+    return Task(f"key{number}", f"task {number}", f"job{number}", ENCODE, before=before, **more)
+
+
+def counting(task: Task, place: Place, report: Report) -> Outcome:
+    """Write a line for each call; fail where the options say so."""
+    with Path(place.store, "calls").open("a") as calls:
+        calls.write(f"{task.key}\n")
+    failures = int(task.words[0]) if task.words else 0
+    if Path(place.store, "calls").read_text().split().count(task.key) <= failures:
+        return Outcome(task.key, False, error="it failed")
+    report({"percent": 50.0})
+    return Outcome(task.key, True, {"number": 1}, worker="a worker")
+
+
+def outcomes(client: Client, place: Path, tasks: list[Task], runner: engine.Runner = counting) -> list[Event]:
+    made = Engine(lambda: client, Place(str(place)), runner)
+    made.add(tasks)
+    return list(made.events())
+
+
+def calls(place: Path) -> list[str]:
+    return (place / "calls").read_text().split()
+
+
+def test_tasks_follow_those_that_they_need(threads: Client, tmp_path: Path) -> None:
+    tasks = [task(2, ("key0", "key1")), task(0), task(1)]
+    events = outcomes(threads, tmp_path, tasks)
+    assert [event.task.key for event in events if event.kind == "done"][-1] == "key2"
+    assert sorted(calls(tmp_path)) == ["key0", "key1", "key2"] and calls(tmp_path)[-1] == "key2"
+
+
+def test_a_task_that_fails_is_tried_once_more_and_others_end(threads: Client, tmp_path: Path) -> None:
+    tasks = [task(0, words=("1",)), task(1, words=("2",)), task(2, ("key1",)), task(3)]
+    ended = {event.task.key: event.kind for event in outcomes(threads, tmp_path, tasks) if event.kind != "runs"}
+    assert ended == {"key0": "done", "key1": "failed", "key2": "failed", "key3": "done"}
+    assert sorted(calls(tmp_path)) == ["key0", "key0", "key1", "key1", "key3"]
+
+
+def test_tasks_that_are_done_are_not_done_again_and_need_no_cluster(tmp_path: Path) -> None:
+    made = Engine(lambda: pytest.fail("a cluster was made"), Place(str(tmp_path)), counting)
+    made.know({"key0": Outcome("key0", True)})
+    made.add([task(0), task(0)])
+    assert [event.kind for event in made.events()] == ["done", "done"]
+
+
+def test_many_tasks_are_done_once_each(threads: Client, tmp_path: Path) -> None:
+    events = outcomes(threads, tmp_path, [task(number) for number in range(200)])
+    assert sum(event.kind == "done" for event in events) == 200
+    assert len(calls(tmp_path)) == len(set(calls(tmp_path))) == 200
+
+
+def test_a_job_larger_than_any_worker_is_one_line(threads: Client, tmp_path: Path) -> None:
+    with pytest.raises(engine.ClusterError, match='--resources "cores=3"'):
+        outcomes(threads, tmp_path, [task(0, resources=Resources(cores=3))])
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "CONNECT_S", 0.2)
+    with (
+        pytest.raises(engine.ClusterError, match="no Dask scheduler answers"),
+        engine.remote_cluster("tcp://127.0.0.1:9"),
+    ):
+        pass
+
+
+def in_steps(task: Task, place: Place, report: Report) -> Outcome:
+    """Do ten steps, each kept in the store, beginning where another worker was killed."""
+    store = Store(place.store)
+    for step in range(len(store.names(f"{task.key}/step*")), 10):
+        Path(place.store, f"{task.key}.{step}.{os.getpid()}").touch()
+        time.sleep(0.1)
+        store.put_json(step, f"{task.key}/step{step}")
+    store.put_json({}, f"{task.key}/{RESULT}")
+    return Outcome(task.key, True, worker=str(os.getpid()))
+
+
+def test_a_worker_that_is_killed_is_replaced_and_its_task_goes_on(tmp_path: Path) -> None:
+    killed: list[int] = []
+    with engine.local_cluster(2, Resources()) as client:
+        made = Engine(lambda: client, Place(str(tmp_path)), in_steps)
+        made.add([task(number) for number in range(3)])
+        done = []
+        for event in made.events():
+            done += [event.task.key] * (event.kind == "done")
+            begun = sorted(tmp_path.glob("key0.3.*"))
+            if begun and not killed:
+                killed.append(int(begun[0].name.rsplit(".", 1)[1]))
+                os.kill(killed[0], signal.SIGKILL)
+    steps = [file.name.split(".")[:2] for file in tmp_path.glob("key?.*")]
+    assert sorted(done) == ["key0", "key1", "key2"] and killed
+    assert len(Store(str(tmp_path)).names("*/step*")) == 30
+    assert 30 <= len(steps) <= 32  # at most the step of each task that the killed worker was in is done twice
+
+
+def test_a_child_ends_with_its_worker(tmp_path: Path) -> None:
+    code = (
+        "import subprocess, sys, os, time\n"
+        "child = subprocess.Popen([sys.executable, '-c', 'import sys, time; from kpc.tools.batch import child; "
+        "child.commands.kpenc = lambda words: time.sleep(60) or 0; sys.exit(child.main(sys.argv[1:]))', "
+        "str(os.getpid()), 'kpenc'])\n"
+        "print(child.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    worker = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert worker.stdout is not None
+    child = int(worker.stdout.readline())
+    worker.kill()
+    worker.wait()
+    worker.stdout.close()
+    for _ in range(300):
+        if not is_running(child):
+            return
+        time.sleep(0.1)
+    os.kill(child, signal.SIGKILL)
+    pytest.fail("the child goes on")
+
+
+def is_running(pid: int) -> bool:
+    """Return whether a process exists that has not ended yet."""
+    try:
+        os.kill(pid, 0)
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (ProcessLookupError, FileNotFoundError):
+        return False
+
+
+def test_changed_files_of_a_work_folder_reach_the_store(tmp_path: Path) -> None:
+    work, store = tmp_path / "work", Store(str(tmp_path / "store"))
+    (work / "group-0000").mkdir(parents=True)
+    for name in ("group-0000/checkpoint.kpck", "pixels-1.bin", ".checkpoint.tmp"):
+        (work / name).write_bytes(b"1")
+    uploads = working.Uploads(work, store, "key/work")
+    uploads.run()
+    assert store.names("key/work/*") == ["key/work/group-0000"]
+    assert store.names("key/work/*/*") == ["key/work/group-0000/checkpoint.kpck"]
+    store.remove("key/work/group-0000/checkpoint.kpck")
+    uploads.run()
+    assert not store.exists("key/work/group-0000/checkpoint.kpck")
+    (work / "group-0000/checkpoint.kpck").write_bytes(b"22")
+    uploads.run()
+    assert store.exists("key/work/group-0000/checkpoint.kpck")
+
+
+def test_files_are_coded_and_failures_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, broken, out = tmp_path / "scene.kpc", tmp_path / "broken.kpc", tmp_path / "out"
+    planes = tiny_scene(scales=1, channels=2, resolution=(6, 5, 4), time=3)
+    write_scene(quantise_scene(planes, [dict.fromkeys(scale, 0.05) for scale in planes.scales]), scene)
+    broken.write_bytes(SAMPLE.read_bytes()[:1000])
+    words = [str(scene), str(broken), "-o", str(out), "--workers", "1", "--", "--quality", "20", "--tune-steps", "0"]
+    assert main(words) == 1
+    said = capsys.readouterr()
+    assert "broken failed:" in said.out and "1 of 2 jobs failed" in said.err
+    result = json.loads((out / "scene.json").read_text())
+    assert result["size_bytes"] == (out / "scene.kpc").stat().st_size
+    page = (out / "report.html").read_text()
+    assert "1 of 2 jobs done" in page and 'href="scene.kpc"' in page and "http" not in page
+    (out / "scene.kpc").unlink()
+    assert main([str(scene), "-o", str(out), "--", "--quality", "20", "--tune-steps", "0"]) == 0
+    assert (out / "scene.kpc").stat().st_size == result["size_bytes"]
+
+
+def test_parts_of_a_clip_are_joined(tmp_path: Path) -> None:
+    store = Store(str(tmp_path))
+    for number in range(2):
+        store.put(SAMPLE, f"key{number}/{SCENE}")
+    joined = Task("joined", "clip", "clip", "join", before=("key0", "key1"))
+    outcome = working.run(joined, Place(str(tmp_path), str(tmp_path / "scratch")))
+    assert outcome.is_done and outcome.figures["groups"] == 2, outcome.error
+    assert not list((tmp_path / "scratch/kpbatch").glob("task-*"))
+
+
+def test_options_of_folders_are_checked(tmp_path: Path, take: Path) -> None:
+    with pytest.raises(FaultyBatch, match="invalid test_views value"):
+        jobs.jobs_of_folders([str(take)], ["--test-views", "0.5"], Resources())
+    with pytest.raises(UsageError, match="no such"):
+        jobs.jobs_of_folders([str(tmp_path / "none")], [], Resources())

@@ -1,0 +1,273 @@
+"""The jobs of a batch, from a TOML file or from folders, checked as a whole before anything starts.
+
+output = "out"                        # a folder or an address
+[options]                             # options of kpenc for all scenes, without their dashes
+preset = "fast"
+[grid]                                # all combinations of these
+quality = [40, 70, 100]
+[resources]                           # that each job takes
+cores = 2
+[[scene]]
+source = "videos/take01"              # beside the file, or an address
+options = { steps = 2000 }
+"""
+
+import contextlib
+import io
+import itertools
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from kpc.format.common import cli
+from kpc.format.common.errors import UsageError
+from kpc.tools.batch.toml_lines import TomlLines
+
+# Options of kpenc that a batch sets itself, or that make no sense in one.
+REFUSED = ("output", "o", "work", "keep", "resume", "dry-run", "json", "only", "preview", "keep-checkpoint", "version")
+TABLES = {"options", "grid", "resources"}
+SCENE_KEYS = {"source", "name", "options", "resources"}
+ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+# Characters of names that are replaced in names of files.
+UNSAFE = re.compile(r"[^\w.+-]+")
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What a job takes of a worker.
+
+    Attributes:
+        cores: processor cores, which it uses fully.
+        memory: bytes; 0 if it was not said.
+        gpus: graphics cards.
+    """
+
+    cores: int = 1
+    memory: int = 0
+    gpus: int = 0
+
+
+@dataclass(frozen=True)
+class Job:
+    """A scene to encode, or a .kpc file to code anew, with one set of options.
+
+    Attributes:
+        name: of the result, without .kpc.
+        source: a path or an address.
+        options: of kpenc, as words of its command line.
+        group: whether the clip is encoded in groups, each by itself.
+        resources: that it takes, or each of its groups.
+        where: in which file and line it stands, for messages.
+    """
+
+    name: str
+    source: str
+    options: tuple[str, ...] = ()
+    group: bool = False
+    resources: Resources = field(default_factory=Resources)
+    where: str = ""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Jobs, and the folder or address that their results go to."""
+
+    jobs: tuple[Job, ...]
+    output: str
+
+
+class FaultyBatch(UsageError):
+    """Something in a batch is wrong; `faults` has a line for each fault."""
+
+    def __init__(self, faults: Sequence[str]) -> None:
+        super().__init__("; ".join(faults))
+        self.faults = tuple(faults)
+
+
+class Faults:
+    """Collects what is wrong with a batch, one line for each fault."""
+
+    def __init__(self) -> None:
+        self.lines: dict[str, None] = {}
+
+    def add(self, where: str, text: str) -> None:
+        self.lines[f"{where}: {text}"] = None
+
+    def check(self) -> None:
+        """Raise FaultyBatch if there are faults."""
+        if self.lines:
+            raise FaultyBatch(list(self.lines))
+
+
+def read_jobs(path: Path) -> Batch:
+    """Read a batch from a TOML file.
+
+    Raises:
+        UsageError: it cannot be read.
+        FaultyBatch: something in it is wrong.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        document = tomllib.loads(text)
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    lines, faults = TomlLines(path, text), Faults()
+    for key in document.keys() - TABLES - {"output", "scene"}:
+        faults.add(lines.of(key), f"{key!r} is not known; known are output, scene, {', '.join(sorted(TABLES))}")
+    output = document.get("output")
+    if not isinstance(output, str) or not output:
+        faults.add(lines.of("output"), 'output names the folder of the results; write for example output = "out"')
+    scenes = document.get("scene", [])
+    if not isinstance(scenes, list) or not scenes or not all(isinstance(scene, dict) for scene in scenes):
+        faults.add(lines.of("scene"), 'there is no scene; write [[scene]], and below it source = "FOLDER"')
+        scenes = []
+    common = {table: _table(document, table, lines.of(table), faults) for table in TABLES}
+    for key, values in common["grid"].items():
+        if not isinstance(values, list) or not values:
+            faults.add(lines.of(key), f"{key} in the grid is not a list; write for example {key} = [40, 70, 100]")
+            common["grid"][key] = [values]
+    jobs: list[Job] = []
+    for number, scene in enumerate(scenes):
+        jobs += _jobs_of(scene, number, common, path.parent, lines, faults)
+    _check_names(jobs, faults)
+    faults.check()
+    return Batch(tuple(jobs), resolve(str(output), path.parent))
+
+
+def jobs_of_folders(folders: Sequence[str], options: Sequence[str], resources: Resources) -> tuple[Job, ...]:
+    """Return a job for each folder, file or address, all with the same options of kpenc.
+
+    Raises:
+        FaultyBatch: an option is wrong or a source is missing.
+    """
+    faults, here = Faults(), Path()
+    jobs = []
+    for folder in folders:
+        source = resolve(folder, here)
+        if not ADDRESS.match(source) and not Path(source).exists():
+            faults.add(folder, "no such file or folder")
+            continue
+        jobs.append(Job(name_of(source), source, tuple(options), _has(options, "--group"), resources, folder))
+        _check_job(jobs[-1], faults)
+    _check_names(jobs, faults)
+    faults.check()
+    return tuple(jobs)
+
+
+def resolve(text: str, folder: Path) -> str:
+    """Return an address as it is, and a path as an absolute one, relative to a folder."""
+    return text if ADDRESS.match(text) else str((folder / text).expanduser().absolute())
+
+
+def name_of(source: str) -> str:
+    """Return the name of a result that is made of a path or an address."""
+    last = source.rstrip("/").rsplit("/", 1)[-1]
+    return UNSAFE.sub("_", Path(last).stem if last.endswith(".kpc") else last) or "scene"
+
+
+def _table(document: Mapping[str, Any], name: str, where: str, faults: Faults) -> dict[str, Any]:
+    found = document.get(name, {})
+    if isinstance(found, dict):
+        return found
+    faults.add(where, f"{name} is not a table; write [{name}]")
+    return {}
+
+
+def _jobs_of(
+    scene: dict[str, Any], number: int, common: Mapping[str, Any], folder: Path, lines: TomlLines, faults: Faults
+) -> Iterator[Job]:
+    """Yield the jobs of one [[scene]]: one for each point of the grid."""
+    where = lines.of("scene", number)
+    for key in scene.keys() - SCENE_KEYS:
+        faults.add(lines.of(key, number), f"{key!r} is not known; a scene has {', '.join(sorted(SCENE_KEYS))}")
+    source = scene.get("source")
+    if not isinstance(source, str) or not source:
+        faults.add(where, 'the scene has no source; write for example source = "videos/take01"')
+        return
+    source = resolve(source, folder)
+    if not ADDRESS.match(source) and not Path(source).exists():
+        faults.add(lines.of("source", number), f"{source}: no such file or folder")
+        return
+    name = scene.get("name", name_of(source))
+    if not isinstance(name, str) or not name or UNSAFE.search(name):
+        faults.add(lines.of("name", number), f"name = {name!r}: a name has letters, digits, and . _ + - only")
+        return
+    own = _table(scene, "options", where, faults)
+    resources = _resources(common["resources"] | _table(scene, "resources", where, faults), where, faults)
+    grid = {key: value for key, value in common["grid"].items() if key not in own}
+    for point in itertools.product(*grid.values()):
+        chosen = dict(zip(grid, point, strict=True))
+        options = common["options"] | chosen | own
+        parts = [name, *(f"{key}-{UNSAFE.sub('_', str(value))}" for key, value in chosen.items())]
+        words = _words(options, number, lines, faults)
+        job = Job(".".join(parts), source, words, "group" in options, resources, where)
+        _check_job(job, faults)
+        yield job
+
+
+def _words(options: Mapping[str, Any], number: int, lines: TomlLines, faults: Faults) -> tuple[str, ...]:
+    """Return options as words of a command line: those that are true without a value, and none that are false."""
+    words = []
+    for key, value in options.items():
+        name = key.replace("_", "-")
+        if name in REFUSED:
+            faults.add(lines.of(key, number), f"{key}: a batch sets this option of kpenc itself; drop it")
+        elif value is True:
+            words.append(f"--{name}")
+        elif isinstance(value, list) and value and all(isinstance(one, int | float) for one in value):
+            words.append(f"--{name}={','.join(map(str, value))}")
+        elif isinstance(value, str | int | float) and value is not False:
+            words.append(f"--{name}={value}")
+        elif value is not False:
+            faults.add(lines.of(key, number), f"{key}: {value!r} is not a value of an option")
+    return tuple(words)
+
+
+def _resources(given: Mapping[str, Any], where: str, faults: Faults) -> Resources:
+    """Return the resources that a table names."""
+    for key in given.keys() - {"cores", "memory", "gpus"}:
+        faults.add(where, f"{key!r} is not a resource; known are cores, memory and gpus")
+    counts = {}
+    for key, least in ("cores", 1), ("gpus", 0):
+        value = given.get(key, least)
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            faults.add(where, f"{key} = {value!r} is not a whole number from {least} on")
+            value = least
+        counts[key] = value
+    memory = 0
+    if "memory" in given:
+        try:
+            memory = cli.byte_count(str(given["memory"]))
+        except Exception as error:  # argparse's, which has the words
+            faults.add(where, f"memory: {error}")
+    return Resources(counts["cores"], memory, counts["gpus"])
+
+
+def _check_job(job: Job, faults: Faults) -> None:
+    """Check the options by kpenc's own parser."""
+    from kpc.encoder.cli import options as kpenc  # loads PyTorch, which workers need not
+
+    source = "folder" if ADDRESS.match(job.source) and not job.source.endswith(".kpc") else job.source
+    if ADDRESS.match(job.source) and job.source.endswith(".kpc"):
+        return  # its options are checked once the file is there
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            kpenc.parse([source, "-o", "scene.kpc", *job.options])
+    except SystemExit:
+        faults.add(job.where, said.getvalue().strip().rsplit("error: ", 1)[-1])
+
+
+def _check_names(jobs: Sequence[Job], faults: Faults) -> None:
+    first: dict[str, Job] = {}
+    for job in jobs:
+        other = first.setdefault(job.name, job)
+        if other is not job:
+            faults.add(job.where, f"the name {job.name!r} is taken by {other.where}; give the scene another name")
+
+
+def _has(options: Sequence[str], name: str) -> bool:
+    return any(word == name or word.startswith(f"{name}=") for word in options)

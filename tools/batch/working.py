@@ -1,0 +1,223 @@
+"""What a worker does: run kpenc on a task in a process of its own, and keep what it has come to in the store.
+
+Checkpoints go to the store as they are written, so another worker goes on from there if this one is killed.
+"""
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import fsspec
+
+from kpc.format.common.errors import KpcError
+from kpc.tools.batch.addresses import source_address
+from kpc.tools.batch.store import LOG, RESULT, SCENE, WORK, Store
+from kpc.tools.batch.tasks import ENCODE, JOIN, PREPARE, Outcome, Task
+
+POLL_S = 0.25
+# Lines of a log that a failure shows.
+LAST_LINES = 4
+# Files of a work folder that other workers make by themselves.
+LOCAL_FILES = ("pixels-*", ".*", "*.lock")
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+# What is told of a task that runs: percent done, seconds left, and PSNR, as far as they are known.
+Report = Callable[[dict[str, float]], None]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where tasks are done.
+
+    Attributes:
+        store: address of the shared place.
+        scratch: folder of each worker for what it works on; empty for the system's.
+    """
+
+    store: str
+    scratch: str = ""
+
+
+class TaskError(KpcError):
+    """A task failed; the message says why."""
+
+
+def run(task: Task, place: Place, report: Report = lambda _: None) -> Outcome:
+    """Do a task; return its outcome, of a failure, too.
+
+    Nothing is done twice: if the result is in the store, it is returned.
+    """
+    started, worker = time.monotonic(), f"{socket.gethostname()}:{os.getpid()}"
+    try:
+        store = Store(place.store)
+        if store.exists(f"{task.key}/{RESULT}"):
+            return Outcome(task.key, True, store.get_json(f"{task.key}/{RESULT}"))
+        with _scratch_folder(task, place) as folder:
+            figures = _run_in(folder, task, store, place, report)
+        store.put_json(figures, f"{task.key}/{RESULT}")
+        if task.kind != PREPARE:
+            store.remove(f"{task.key}/{WORK}")
+    except (KpcError, OSError) as error:
+        return Outcome(task.key, False, {}, str(error), time.monotonic() - started, worker)
+    return Outcome(task.key, True, figures, "", time.monotonic() - started, worker)
+
+
+def _run_in(folder: Path, task: Task, store: Store, place: Place, report: Report) -> dict[str, Any]:
+    """Do a task in an empty folder, and bring all but its figures to the store; return those."""
+    work, scene = folder / WORK, folder / SCENE
+    work.mkdir()
+    if task.kind == JOIN:
+        parts = [folder / f"{number:04d}.kpc" for number in range(len(task.before))]
+        for key, part in zip(task.before, parts, strict=True):
+            store.get(f"{key}/{SCENE}", part)
+        if len(parts) == 1:
+            parts[0].rename(scene)
+            figures: dict[str, Any] = {}
+        else:
+            figures = _child(["kpjoin", *map(str, parts), "-o", str(scene)], task, folder, store, report)
+        figures |= {"size_bytes": scene.stat().st_size, "groups": len(parts)}
+    else:
+        for key in task.before:
+            store.get_folder(f"{key}/{WORK}", work)
+        resumes = store.get_folder(f"{task.key}/{WORK}", work)
+        source = _local_source(task.source, place)
+        command = [source, "-o", str(scene), *task.words]
+        if Path(source).is_dir():
+            command.append(f"--work={work}")
+        if task.kind == ENCODE:
+            kept = ["--resume"] * resumes if Path(source).is_dir() else []
+            figures = _child(["kpenc", *command, "--json", *kept], task, folder, store, report)
+        else:
+            figures = _child(["prepare", *command], task, folder, store, report)
+            Uploads(work, store, f"{task.key}/{WORK}").run()
+    if scene.exists():
+        store.put(scene, f"{task.key}/{SCENE}")
+    return figures
+
+
+def _child(command: list[str], task: Task, folder: Path, store: Store, report: Report) -> dict[str, Any]:
+    """Run a command in a process that ends with this one; return what it printed as JSON.
+
+    Raises:
+        TaskError: it failed.
+    """
+    log, out = folder / LOG, folder / "out.json"
+    words = [sys.executable, "-m", "kpc.tools.batch.child", str(os.getpid()), *command]
+    environment = os.environ | dict.fromkeys(THREADS, str(task.resources.cores))
+    uploads = Uploads(folder / WORK, store, f"{task.key}/{WORK}")
+    with log.open("wb") as errors, out.open("wb") as results:
+        process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=results, stderr=errors, env=environment)
+    try:
+        while process.poll() is None:
+            time.sleep(POLL_S)
+            uploads.run()
+            report(_progress(log))
+    finally:
+        process.kill()
+        process.wait()
+        store.put(log, f"{task.key}/{LOG}")
+    if process.returncode:
+        lines = log.read_text(errors="replace").strip().splitlines()[-LAST_LINES:]
+        raise TaskError("\n".join(lines) or f"ended with exit code {process.returncode}")
+    try:
+        figures: dict[str, Any] = json.loads(out.read_text() or "{}")
+    except ValueError:
+        figures = {}  # of a command that prints none
+    figures.pop("file", None)  # that of this folder
+    return figures
+
+
+class Uploads:
+    """Brings the files of a work folder to the store whenever they have changed."""
+
+    def __init__(self, work: Path, store: Store, name: str) -> None:
+        self._work, self._store, self._name = work, store, name
+        self._sent: dict[Path, tuple[int, int]] = {}
+
+    def run(self) -> None:
+        for file in sorted(self._work.rglob("*")):
+            inner = file.relative_to(self._work)
+            if any(part.startswith(".") for part in inner.parts) or any(file.match(each) for each in LOCAL_FILES):
+                continue
+            with contextlib.suppress(FileNotFoundError):  # it has been removed or renamed
+                state = file.stat()
+                if file.is_file() and self._sent.get(inner) != (state.st_mtime_ns, state.st_size):
+                    self._store.put(file, f"{self._name}/{inner.as_posix()}")
+                    self._sent[inner] = state.st_mtime_ns, state.st_size
+
+
+def _local_source(source: str, place: Place) -> str:
+    """Return the path of a source; fetch what lies at an address, once for all tasks of this machine.
+
+    Raises:
+        TaskError: this machine has no such path.
+    """
+    if "://" not in source:
+        if not Path(source).exists():
+            raise TaskError(f"{source}: is not on {socket.gethostname()}; share that folder, or name it by an address")
+        return source
+    target = _scratch(place) / "sources" / source_address(source) / source.rstrip("/").rsplit("/", 1)[-1]
+    if not target.exists():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+            fetched = Path(folder) / target.name
+            fs, root = fsspec.core.url_to_fs(source)
+            for name in sorted(fs.find(root)) or [root]:
+                inner = name.removeprefix(root).lstrip("/")
+                file = fetched / inner if inner else fetched
+                file.parent.mkdir(parents=True, exist_ok=True)
+                fs.get_file(name, str(file))
+            with contextlib.suppress(OSError):  # another task was faster
+                fetched.rename(target)
+    return str(target)
+
+
+def _scratch(place: Place) -> Path:
+    return Path(place.scratch or tempfile.gettempdir()) / "kpbatch"
+
+
+@contextlib.contextmanager
+def _scratch_folder(task: Task, place: Place) -> Iterator[Path]:
+    """Yield an empty folder, which is removed at the end; remove those that killed workers have left."""
+    base = _scratch(place)
+    base.mkdir(parents=True, exist_ok=True)
+    for left in base.glob("task-*-*"):
+        if not _is_alive(int(left.name.split("-")[1])):
+            shutil.rmtree(left, ignore_errors=True)
+    folder = base / f"task-{os.getpid()}-{task.key}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _progress(log: Path) -> dict[str, float]:
+    """Return what the last line of a log says of progress: percent, seconds left, PSNR."""
+    lines = log.read_text(errors="replace").splitlines()
+    line = next((line for line in reversed(lines) if " %" in line or " dB" in line), "")
+    patterns = {"percent": r": (\d+) %", "left_s": r"(\d+) s left", "psnr": r"([\d.]+) dB"}
+    found = {name: re.search(pattern, line) for name, pattern in patterns.items()}
+    return {name: float(match[1]) for name, match in found.items() if match}

@@ -1,0 +1,144 @@
+"""kpbatch: encode many scenes, and code many files, on this machine or on many.
+
+    kpbatch jobs.toml                                    the scenes, options and grids of a file
+    kpbatch take01/ take02/ -o out/ -- --preset fast     folders, all with the same options of kpenc
+    kpbatch jobs.toml --scheduler tcp://head:8786        on a Dask cluster that runs
+
+What is done is not done again: run the same command after an interruption, or with more scenes.
+"""
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from kpc.format.common import cli
+from kpc.format.common.errors import KpcError, UsageError
+from kpc.tools.batch.jobs import Batch, FaultyBatch, Job, Resources, jobs_of_folders, read_jobs, resolve
+from kpc.tools.batch.store import Store
+from kpc.tools.batch.summary import SHARED, print_summary, publish, write_report
+from kpc.tools.batch.tasks import PREPARE, Outcome, done_before, first_tasks, is_last, tasks_of_groups
+
+
+class BatchError(KpcError):
+    """Some jobs failed."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    return cli.run(_command, "kpbatch", argv)
+
+
+def _command(argv: list[str]) -> None:
+    options, words = _parse(argv)
+    try:
+        batch = _batch(options, words)
+    except FaultyBatch as error:
+        *others, last = error.faults
+        for fault in others:
+            print(f"kpbatch: {fault}", file=sys.stderr)
+        raise UsageError(last) from error
+    shared = f"{batch.output.rstrip('/')}/{SHARED}"
+    store, output = Store(shared), Store(batch.output)
+    first, known = first_tasks(batch.jobs), done_before(store)
+    if options.dry_run:
+        for task in first:
+            print(f"{task.key} {'done' if task.key in known else 'to do':<5} {task.name}: {task.source}")
+        return
+    ended = _run(batch.jobs, shared, known, options)
+    failed = publish(batch.jobs, ended, store, output)
+    print_summary(batch.jobs, ended, options.json)
+    write_report(batch.jobs, ended, output)
+    if failed:
+        raise BatchError(f"{failed} of {len(batch.jobs)} jobs failed; run the same command to try them again")
+
+
+def _run(
+    jobs: Sequence[Job], shared: str, known: dict[str, Outcome], options: argparse.Namespace
+) -> dict[str, Outcome]:
+    """Do what is not done, and return the outcomes of jobs by their names."""
+    from kpc.tools.batch import engine as scheduling  # Dask takes a second to load, which --help can do without
+    from kpc.tools.batch.page import Page
+    from kpc.tools.batch.working import Place
+
+    by_name, ended = {job.name: job for job in jobs}, {}
+    most = Resources(
+        max(job.resources.cores for job in jobs),
+        max(job.resources.memory for job in jobs),
+        max(job.resources.gpus for job in jobs),
+    )
+    with contextlib.ExitStack() as stack:
+
+        def connect() -> scheduling.Client:
+            if options.scheduler:
+                client = stack.enter_context(scheduling.remote_cluster(options.scheduler))
+            else:
+                workers = options.workers or scheduling.local_workers(most)
+                client = stack.enter_context(scheduling.local_cluster(workers, most))
+            if find_spec("bokeh") is not None:  # which draws it
+                print(f"Dask's dashboard: {client.dashboard_link}", file=sys.stderr)
+            return client
+
+        engine, page = scheduling.Engine(connect, Place(shared, options.scratch or "")), Page(options.json)
+        engine.know(known)
+        engine.add(first_tasks(jobs))
+        for event in engine.events():
+            page.show(event)
+            if event.kind not in ("done", "failed") or event.outcome is None:
+                continue
+            if is_last(event.task, jobs) or event.kind == "failed":
+                ended[event.task.job] = event.outcome
+            elif event.task.kind == PREPARE:
+                engine.add(tasks_of_groups(by_name[event.task.job], event.outcome.figures["groups"]))
+        page.redraw()
+    return ended
+
+
+def _batch(options: argparse.Namespace, words: Sequence[str]) -> Batch:
+    """Return the jobs that the command line names."""
+    first = Path(options.sources[0])
+    if first.suffix == ".toml":
+        if len(options.sources) > 1 or words:
+            raise UsageError(f"{first}: names scenes and options itself; drop what else is given")
+        batch = read_jobs(first)
+        return batch if options.output is None else Batch(batch.jobs, resolve(options.output, Path()))
+    if options.output is None:
+        raise UsageError("-o names the folder of the results; give for example -o out/")
+    jobs = jobs_of_folders(options.sources, words, Resources(options.cores, options.memory or 0))
+    return Batch(jobs, resolve(options.output, Path()))
+
+
+def _parse(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Return the options, and those of kpenc behind --."""
+    parser = argparse.ArgumentParser(
+        prog="kpbatch",
+        description="Encode many scenes, and code many files, on this machine or on a Dask cluster. What is done is "
+        "not done again.",
+        epilog="Options of kpenc for folders follow after --, for example: kpbatch takes/* -o out/ -- --preset fast",
+    )
+    cli.add_version_option(parser)
+    parser.add_argument(
+        "sources", nargs="+", metavar="JOBS.toml|SOURCE", help="a file of jobs; or folders of videos and .kpc files"
+    )
+    parser.add_argument("-o", "--output", type=cli.file_name, metavar="OUT", help="folder or address of the results")
+    parser.add_argument(
+        "--scheduler", metavar="tcp://HOST:PORT", help="a Dask scheduler that runs, in place of workers on this machine"
+    )
+    parser.add_argument("--workers", type=_count, help="jobs at once on this machine (default: by cores and memory)")
+    parser.add_argument("--cores", type=_count, default=1, help="of each job, for folders (default: %(default)s)")
+    parser.add_argument("--memory", type=cli.byte_count, metavar="3GB", help="of each job, for folders")
+    parser.add_argument("--scratch", type=cli.file_name, metavar="DIR", help="folder of workers for what they work on")
+    parser.add_argument("--dry-run", action="store_true", help="only check all jobs, and list what is done")
+    parser.add_argument("--json", action="store_true", help="print a line of JSON for each event, and the results")
+    split = argv.index("--") if "--" in argv else len(argv)
+    return parser.parse_args(argv[:split]), argv[split + 1 :]
+
+
+def _count(text: str) -> int:
+    return int(cli.number_within(text, 1, 4096, "a whole number"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
