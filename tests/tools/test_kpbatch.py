@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,8 +14,6 @@ from typing import Any
 import pytest
 from distributed import Client, LocalCluster
 
-from kpc.encoder.coding.scene_writer import write as write_scene
-from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import UsageError
 from kpc.tools.batch import engine, jobs, working
 from kpc.tools.batch.addresses import source_address
@@ -24,7 +23,6 @@ from kpc.tools.batch.store import RESULT, SCENE, Store, StoreError
 from kpc.tools.batch.tasks import ENCODE, Outcome, Task, done_before, first_tasks, tasks_of_groups
 from kpc.tools.batch.working import Place
 from kpc.tools.cli.kpbatch import main
-from scenes import tiny_scene
 
 SAMPLE = Path(__file__).parent.parent.parent / "samples" / "default.kpc"
 Report = Callable[[dict[str, float]], None]
@@ -44,7 +42,7 @@ def threads() -> Iterator[Client]:
     """A cluster within this process."""
     with (
         LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, resources={"cores": 2}
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0", resources={"cores": 2}
         ) as cluster,
         Client(cluster) as client,
     ):
@@ -303,22 +301,25 @@ def test_changed_files_of_a_work_folder_reach_the_store(tmp_path: Path) -> None:
     assert store.exists("key/work/group-0000/checkpoint.kpck")
 
 
-def test_files_are_coded_and_failures_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene, broken, out = tmp_path / "scene.kpc", tmp_path / "broken.kpc", tmp_path / "out"
-    planes = tiny_scene(scales=1, channels=2, resolution=(6, 5, 4), time=3)
-    write_scene(quantise_scene(planes, [dict.fromkeys(scale, 0.05) for scale in planes.scales]), scene)
+def test_failures_are_listed_and_what_is_done_is_published(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    broken, out = tmp_path / "broken.kpc", tmp_path / "out"
     broken.write_bytes(SAMPLE.read_bytes()[:1000])
-    words = [str(scene), str(broken), "-o", str(out), "--workers", "1", "--", "--quality", "20", "--tune-steps", "0"]
-    assert main(words) == 1
+    options = ["--quality", "20"]
+    (done,) = first_tasks(jobs.jobs_of_folders([str(SAMPLE)], options, Resources()))
+    store = Store(f"{out}/.kpbatch")
+    store.put(SAMPLE, f"{done.key}/{SCENE}")
+    store.put_json({"size_bytes": 57_243, "test_psnr": 33.7}, f"{done.key}/{RESULT}")
+    assert main([str(SAMPLE), str(broken), "-o", str(out), "--workers", "1", "--", *options]) == 1
     said = capsys.readouterr()
-    assert "broken failed:" in said.out and "1 of 2 jobs failed" in said.err
-    result = json.loads((out / "scene.json").read_text())
-    assert result["size_bytes"] == (out / "scene.kpc").stat().st_size
+    assert re.search(r"broken failed:\n.*broken.kpc: cut off at 1,000 of", said.out) and "1 of 2 jobs failed" in said.err
+    assert re.search(r"^default +57,243 +33.70 ", said.out, re.MULTILINE)
+    assert (out / "default.kpc").read_bytes() == SAMPLE.read_bytes()
+    assert json.loads((out / "default.json").read_text())["key"] == done.key
     page = (out / "report.html").read_text()
-    assert "1 of 2 jobs done" in page and 'href="scene.kpc"' in page and "http" not in page
-    (out / "scene.kpc").unlink()
-    assert main([str(scene), "-o", str(out), "--", "--quality", "20", "--tune-steps", "0"]) == 0
-    assert (out / "scene.kpc").stat().st_size == result["size_bytes"]
+    assert "1 of 2 jobs done" in page and 'href="default.kpc"' in page and "http" not in page
+    (out / "default.kpc").unlink()
+    assert main([str(SAMPLE), "-o", str(out), "--", *options]) == 0
+    assert (out / "default.kpc").exists()
 
 
 def test_parts_of_a_clip_are_joined(tmp_path: Path) -> None:

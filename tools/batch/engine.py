@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.util import find_spec
 from typing import Any
 
 import dask
@@ -73,7 +72,7 @@ def local_cluster(workers: int, resources: Resources) -> Iterator[Client]:
             threads_per_worker=1,
             memory_limit=None,
             resources=held,
-            dashboard_address=":0" if find_spec("bokeh") else None,
+            dashboard_address=":0",  # any port that is free
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster) as client,
