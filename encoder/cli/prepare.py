@@ -13,6 +13,7 @@ from kpc.encoder.cli.transcode import check_outputs
 from kpc.encoder.cli.work_folder import CHECKPOINT, choose_device, make_work_folder, remove_if_empty
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.datasets.plausibility import doubts
+from kpc.encoder.evaluation.expectations import expect
 from kpc.encoder.field.bounds import (
     find_box,
     find_contraction_box,
@@ -81,6 +82,10 @@ def prepare_setting(options: Options) -> Setting:
     for doubt in doubts(dataset):
         log(f"warning: {doubt}")
     log(f"space: {SPACES[type(mapping)][1]} ({why})")
+    expectations = expect(dataset, aabb, mapping)
+    log(f"filmed: {expectations.paragraph()}")
+    for warning in expectations.warnings():
+        log(f"warning: {warning}")
     is_final = options.box is not None or isinstance(mapping, Contraction)
     return Setting(dataset, aabb, mapping, is_final, sound=sound, sound_from=sound_from)
 
