@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 from distributed import Client, LocalCluster
 
 from kpc.format.common.errors import UsageError
-from kpc.tools.batch import engine, jobs, working
+from kpc.tools.batch import engine, jobs, simulation, working
 from kpc.tools.batch.addresses import source_address
 from kpc.tools.batch.engine import Engine, Event
 from kpc.tools.batch.jobs import FaultyBatch, Job, Resources
@@ -311,7 +312,9 @@ def test_failures_are_listed_and_what_is_done_is_published(tmp_path: Path, capsy
     store.put_json({"size_bytes": 57_243, "test_psnr": 33.7}, f"{done.key}/{RESULT}")
     assert main([str(SAMPLE), str(broken), "-o", str(out), "--workers", "1", "--", *options]) == 1
     said = capsys.readouterr()
-    assert re.search(r"broken failed:\n.*broken.kpc: cut off at 1,000 of", said.out) and "1 of 2 jobs failed" in said.err
+    assert (
+        re.search(r"broken failed:\n.*broken.kpc: cut off at 1,000 of", said.out) and "1 of 2 jobs failed" in said.err
+    )
     assert re.search(r"^default +57,243 +33.70 ", said.out, re.MULTILINE)
     assert (out / "default.kpc").read_bytes() == SAMPLE.read_bytes()
     assert json.loads((out / "default.json").read_text())["key"] == done.key
@@ -337,3 +340,15 @@ def test_options_of_folders_are_checked(tmp_path: Path, take: Path) -> None:
         jobs.jobs_of_folders([str(take)], ["--test-views", "0.5"], Resources())
     with pytest.raises(UsageError, match="no such"):
         jobs.jobs_of_folders([str(tmp_path / "none")], [], Resources())
+
+
+def test_the_simulation_counts_what_failures_cost() -> None:
+    calm = simulation.Model(scenes=40, workers=4, bad=0.0, failure_s=1e12, input_bytes=0.0, message_s=0.0)
+    found = simulation.simulate(calm)
+    assert found.failures == 0 and found.redone_s == 0 and found.link == found.scheduler == 0
+    assert 0.8 < found.efficiency <= 1 + 1e-9
+    alone = simulation.simulate(replace(calm, workers=1))
+    assert alone.efficiency == pytest.approx(1) and alone.seconds < 4 * found.seconds
+    failing = simulation.simulate(replace(calm, failure_s=1800.0))
+    assert failing.failures > 5 and failing.seconds > found.seconds
+    assert 0 < failing.redone_s <= failing.failures * calm.checkpoint_s
