@@ -80,8 +80,11 @@ def _transcode_groups(options: Options, source: groups.Groups) -> dict[str, Any]
     """Code each group on its own. All coded groups are in memory together."""
     spans, parts, found = source.timeline.spans, [], []
     clip = _with_history(source.metadata(), options)
-    for number, span in enumerate(spans):
-        trade = options_of_group(options, number, spans).trade
+    trades = [options_of_group(options, number, spans).trade for number in range(len(spans))]
+    if options.trade.target_bytes is not None:  # a size that is too small for a late group is refused at once, too
+        for number, trade in enumerate(trades):
+            codec_model.check_size(scene_io.read(source.open(number)), trade, is_coded=True)
+    for number, (span, trade) in enumerate(zip(spans, trades, strict=True)):
         reader = source.open(number)
         metadata = _with_history(reader.metadata(), options)
         scene = replace(scene_io.read(reader), cameras=reader.cameras() or source.cameras(), metadata=metadata)

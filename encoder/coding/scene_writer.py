@@ -43,7 +43,7 @@ from kpc.format.container.segments import rows_per_segment, side_info_at
 from kpc.format.container.sound_chunk import pack_sound
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import QuantisedMotion
-from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder
+from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder, Scene
 from kpc.format.scene.sound import SAMPLE_RATE
 
 
@@ -94,8 +94,12 @@ def _chunks_before_planes(scene: QuantisedScene) -> list[Chunk]:
     if scene.motion is not None:
         chunks.append(_motion_chunk(scene.motion, parsed.is_dynamic))
     chunks += [_decoder_chunk(scene.decoder, parsed.feature_count), _occupancy_chunk(scene.occupancy)]
-    if scene.cameras:
-        chunks.append(_cameras_chunk(scene.cameras))
+    return chunks + _chunks_about(scene)
+
+
+def _chunks_about(scene: Scene | QuantisedScene) -> list[Chunk]:
+    """Return the chunks of cameras, appearances and metadata."""
+    chunks = [_cameras_chunk(scene.cameras)] if scene.cameras else []
     if scene.appearances:
         appe = pack_appearances(scene.appearances, len(scene.decoder.b1))
         parse_appearances(appe, len(scene.decoder.b1))
@@ -103,6 +107,20 @@ def _chunks_before_planes(scene: QuantisedScene) -> list[Chunk]:
     if scene.metadata:
         chunks.append(Chunk("meta", pack_metadata(scene.metadata)))
     return chunks
+
+
+def fixed_bytes(scene: Scene | QuantisedScene, *, with_occupancy: bool) -> int:
+    """Return the bytes that coding the planes more coarsely leaves as they are: a file is larger than that.
+
+    They are those of cameras, appearances, metadata, sound, the header and an index of these.
+
+    Args:
+        scene: to be coded.
+        with_occupancy: whether to count the occupancy grid, too, where it is kept as it is.
+    """
+    chunks = [_occupancy_chunk(scene.occupancy)] if with_occupancy else []
+    sound = [] if scene.sound is None else pack_sound(scene.sound)
+    return len(pack(chunks + _chunks_about(scene) + sound, 0))
 
 
 def _check_planes(scene: QuantisedScene, head: SceneHead) -> None:

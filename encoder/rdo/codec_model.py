@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kpc.encoder.coding.scene_writer import fixed_bytes
 from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, ValidationRays
 from kpc.encoder.rdo.curvature import Curvature, PerPlane, estimate_curvature
 from kpc.encoder.rdo.distortion import PlaneKey
@@ -315,7 +316,7 @@ def code(
     Raises:
         TrainingError: no file of this model is as small as the target.
     """
-    trade.check_size(model.scene.sound)
+    check_size(model.scene, trade, is_coded=model.coded is not None)
     coder = _Coder(model, trade, prune_share, tune_steps, quantise, grids)
     chosen = coder.select()
     tolerance = TOLERANCE if model.effort == 1 else QUICK_TOLERANCE
@@ -334,6 +335,20 @@ def code(
     return CodedModel(
         found.quantised, found.data, measured.psnr, loss_db, measured.agreement_db, pruned, chosen.spare_db
     )
+
+
+def check_size(scene: Scene | QuantisedScene, trade: Trade, *, is_coded: bool) -> None:
+    """Refuse a target size that no choice of steps can reach, before the search for one.
+
+    Args:
+        scene: to be coded.
+        trade: the target.
+        is_coded: whether it comes from a file, whose cells stay as they are; those of a trained scene are to be chosen.
+
+    Raises:
+        TrainingError: what coding leaves as it is takes more.
+    """
+    trade.check_size(scene.sound, fixed_bytes(scene, with_occupancy=is_coded))
 
 
 def load(path: Path) -> Model:

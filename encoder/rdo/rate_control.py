@@ -97,22 +97,26 @@ class Trade:
                 return name, float(value)
         return "max_loss_db", DEFAULT_LOSS_DB
 
-    def check_size(self, sound: Sound | None) -> None:
+    def check_size(self, sound: Sound | None, fixed: int = 0) -> None:
         """Refuse a size that what is not coded by rate and distortion takes alone, before hours are spent.
 
         Args:
             sound: of the file.
+            fixed: bytes that all files of the model have, sound included (`scene_writer.fixed_bytes`); 0 before there
+                is a model.
 
         Raises:
-            TrainingError: header, index and sound take more.
+            TrainingError: they take more.
         """
         heard = 0 if sound is None else sum(map(len, sound.packets))
-        least = HEADER.size + MIN_CHUNKS * ENTRY.size + heard
+        least = max(fixed, HEADER.size + MIN_CHUNKS * ENTRY.size + heard)
         if self.target_bytes is not None and self.target_bytes < least:
+            what = "what no quantisation step shrinks (occupancy, cameras, metadata, sound)"
+            what = what if fixed == least else "header, index and sound alone"
             remedy = ", or encode with less sound (--audio-bitrate, --audio none)" if heard else ""
             raise TrainingError(
-                f"--target-size leaves {self.target_bytes:,} bytes for the scene, and header, index and sound alone "
-                f"take {least:,}; give a larger size{remedy}"
+                f"--target-size leaves {self.target_bytes:,} bytes for the scene, and {what} "
+                f"take{'s' * (fixed == least)} {least:,}; give a larger size{remedy}"
             )
 
     def loss_db(self, psnr: float) -> float:

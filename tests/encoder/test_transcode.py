@@ -23,7 +23,7 @@ from kpc.encoder.rdo.mode_decision import requested_step
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import TrainingError
-from kpc.format.container import rewriting, scene_io
+from kpc.format.container import groups, rewriting, scene_io
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
@@ -224,6 +224,25 @@ def test_a_file_becomes_smaller(scene_file: Path, tmp_path: Path, kpenc_says: Kp
 def test_a_file_keeps_its_symbols_at_a_loose_target(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
     kpenc_says(scene_file, tmp_path / "same.kpc", "--target-size", "1MB")
     assert (tmp_path / "same.kpc").read_bytes() == scene_file.read_bytes()
+
+
+@pytest.mark.parametrize("is_grouped", [False, True])
+def test_a_size_below_what_no_step_shrinks_is_refused_before_the_search(
+    scene_file: Path,
+    tmp_path: Path,
+    refused: Callable[..., str],
+    monkeypatch: pytest.MonkeyPatch,
+    is_grouped: bool,
+) -> None:
+    scene = replace(scene_io.read(scene_file), occupancy=np.random.default_rng(0).random((1, 32, 32, 32)) < 0.5)
+    scene_writer.write(scene, scene_file)
+    if is_grouped:
+        later = tmp_path / "later.kpc"
+        scene_file.rename(later)
+        scene_writer.write(replace(scene, occupancy=scene.occupancy[:, :1]), tmp_path / "early.kpc")
+        groups.write(groups.group_inputs([tmp_path / "early.kpc", later]), scene_file)
+    monkeypatch.setattr(codec_model, "estimate_curvature", None)  # measuring what errors cost takes minutes
+    assert "occupancy, cameras, metadata, sound) takes" in refused(scene_file, "--target-size", "4KB")
 
 
 def test_a_file_cannot_be_coded_to_a_psnr(scene_file: Path, refused: Callable[..., str]) -> None:
