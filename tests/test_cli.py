@@ -3,6 +3,8 @@
 import errno
 import importlib
 import importlib.metadata
+import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -107,3 +109,32 @@ def test_every_command_prints_its_version(module: str, capsys: pytest.CaptureFix
 )
 def test_sizes(text: str, count: int) -> None:
     assert cli.byte_count(text) == count
+
+
+@pytest.mark.parametrize(
+    ("name", "is_folder", "complaint"),
+    [
+        ("there/new.kpc", False, None),
+        ("there", True, None),
+        ("new/and/below", True, None),
+        ("there", False, "there: is a folder; give the name of a file"),
+        ("new/new.kpc", False, "new: no such folder; make it first"),
+        ("file/new.kpc", False, "file: is a file, not a folder"),
+        ("file", True, "file: is a file, not a folder"),
+        ("file/new", True, "file: is a file, not a folder"),
+    ],
+)
+def test_output_is_checked_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, is_folder: bool, complaint: str | None
+) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "file").touch()
+    if complaint is not None:
+        with pytest.raises(UsageError, match=re.escape(complaint)):
+            cli.check_writable(tmp_path / name, is_folder=is_folder)
+        return
+    cli.check_writable(tmp_path / name, is_folder=is_folder)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(OSError, match="no permission to write there") as caught:
+        cli.check_writable(tmp_path / name, is_folder=is_folder)
+    assert caught.value.filename == str(tmp_path / name)

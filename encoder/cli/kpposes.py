@@ -25,6 +25,7 @@ def main(argv: list[str] | None = None) -> int:
 def _command(argv: list[str]) -> None:
     options = _parser().parse_args(argv)
     file = options.output or options.folder / "transforms.json"
+    cli.check_writable(file)
     found = find_poses(options.folder, wishes_from(options))
     write_document(found, options.folder, file)
     print(report(found))

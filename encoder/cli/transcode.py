@@ -1,11 +1,9 @@
 """Coding a finished checkpoint or a .kpc file anew, without pictures and without training."""
 
-import os
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from kpc.encoder.cli.grouped import options_of_group
@@ -13,7 +11,8 @@ from kpc.encoder.cli.options import Options
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.rdo import codec_model
 from kpc.encoder.rdo.rate_control import Trade
-from kpc.format.common.errors import TrainingError, UsageError
+from kpc.format.common import cli
+from kpc.format.common.errors import UsageError
 from kpc.format.common.version import VERSION
 from kpc.format.container import groups, rewriting, scene_io
 from kpc.format.container.container import MAGIC
@@ -161,20 +160,11 @@ def check_outputs(options: Options) -> None:
     """Check before training, which may take hours, that the output files can be written.
 
     Raises:
-        UsageError, TrainingError: one cannot.
+        UsageError, OSError: one cannot.
     """
     if options.output.exists() and options.source.is_file() and options.output.samefile(options.source):
         raise UsageError(f"{options.output}: is the source, too; write elsewhere with -o")
     for output in filter(None, (options.output, options.keep_checkpoint)):
-        _check_writable(output)
+        cli.check_writable(output)
     if options.output.suffix.lower() != ".kpc":
         raise UsageError(f"{options.output}: kpenc writes .kpc files; end the name in .kpc")
-
-
-def _check_writable(output: Path) -> None:
-    if output.is_dir():
-        raise UsageError(f"{output}: is a folder; name a file such as {output / 'scene.kpc'}")
-    if not output.parent.is_dir():
-        raise UsageError(f"{output.parent}: no such folder; make it first")
-    if not os.access(output.parent, os.W_OK):
-        raise TrainingError(f"{output.parent}: no permission to write there; choose another place with -o")

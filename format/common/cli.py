@@ -140,6 +140,32 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)  # unless it has been renamed
 
 
+def check_writable(path: Path, *, is_folder: bool = False) -> None:
+    """Check, before work that may take hours, that a file or a folder can be written.
+
+    Args:
+        path: of the file, whose folder must be there, or of a folder, which may be made with those above it.
+        is_folder: which of both.
+
+    Raises:
+        UsageError: a folder is missing, is a file, or has the name of the file.
+        OSError: there is no permission to write there; the error names `path`.
+    """
+    above = path.absolute()
+    if not is_folder:
+        if above.is_dir():
+            raise UsageError(f"{path}: is a folder; give the name of a file")
+        above = above.parent
+    while is_folder and not above.exists() and above != above.parent:
+        above = above.parent
+    if above.exists() and not above.is_dir():
+        raise UsageError(f"{above}: is a file, not a folder; give another name")
+    if not above.is_dir():
+        raise UsageError(f"{above}: no such folder; make it first, or choose another place with -o")
+    if not os.access(above, os.W_OK):
+        raise OSError(errno.EACCES, "no permission to write there; choose another place with -o", str(path))
+
+
 def make_folder(path: Path) -> None:
     """Make a folder, and those above it, unless it is there.
 

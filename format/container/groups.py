@@ -403,6 +403,7 @@ def write(parts: Sequence[GroupInput], path: str | os.PathLike[str], metadata: M
 
     Raises:
         UsageError: the parts do not make up a clip.
+        FormatError: a part is damaged.
     """
     check_parts(parts)
     odd = next((part for part in parts if part.fps != parts[0].fps), None)
@@ -422,6 +423,7 @@ def write(parts: Sequence[GroupInput], path: str | os.PathLike[str], metadata: M
             crc, size = google_crc32c.value(body), len(body)
             entries.append(Entry("meta", 0, 0, 0, 0, 0, Codec.RAW, size, size, crc))
         for number, part in enumerate(parts):
+            _check_whole(part.source)
             body, span = part.source.read_at(0, part.source.size), part.span
             opened.write(body)
             crc, size = google_crc32c.value(body), len(body)
@@ -430,6 +432,17 @@ def write(parts: Sequence[GroupInput], path: str | os.PathLike[str], metadata: M
         opened.seek(0)
         opened.write(header_and_index(entries, max(part.value_count for part in parts), compress=False))
     return size_bytes
+
+
+def _check_whole(source: Source) -> None:
+    """Check the CRC32C of every chunk, since that of the group that a file becomes would vouch for its damage.
+
+    Raises:
+        FormatError: one differs.
+    """
+    reader = Reader(source)
+    for number in range(len(reader.index)):
+        reader.stored(number)
 
 
 def check_spans(spans: Sequence[Span], names: str | Sequence[str]) -> None:

@@ -13,6 +13,15 @@ import numpy as np
 from kpc.format.scene.cameras import Camera
 
 HISTORY_LIMIT = 64  # entries of the history; the last ones are kept
+# Members whose own members hold for a clip where its parts agree, and words for those whose names are not plain.
+PARTLY_AGREED = ("provenance", "options")
+WORDS = {
+    "cameras": "camera names",
+    "transparent": "mark as transparent",
+    "held_out": "held-out quality",
+    "coding_loss_db": "coding loss",
+    "dataset_sha256": "dataset",
+}
 
 
 @dataclass(frozen=True)
@@ -153,6 +162,22 @@ def merged(parts: list[Metadata]) -> Metadata:
     return Metadata(found)
 
 
+def differences(parts: list[Metadata]) -> list[str]:
+    """Return, in words, the members of parts that `merged` leaves out because they are not alike in all."""
+    return _differing([part.document for part in parts], merged(parts).document)
+
+
+def _differing(documents: list[Mapping[str, Any]], kept: Mapping[str, Any], of: str = "") -> list[str]:
+    found = []
+    for name in dict.fromkeys(name for document in documents for name in document):
+        if name in PARTLY_AGREED:
+            inner = [document.get(name, {}) for document in documents]
+            found += _differing(inner, kept.get(name, {}), "option " if name == "options" else "")
+        elif name not in kept:
+            found.append(of + WORDS.get(name, name).replace("_", " "))
+    return found
+
+
 def _intersection(limits: list[dict[str, Any] | None]) -> dict[str, Any] | None:
     """Return the view limits within all others; None if some lack, lie around another focus or exclude others."""
     known = [one for one in limits if one is not None]
@@ -169,13 +194,13 @@ def _intersection(limits: list[dict[str, Any] | None]) -> dict[str, Any] | None:
 
 
 def _agreed(documents: list[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the members that all documents have and agree on; of provenance, its members that do."""
+    """Return the members that all documents have and agree on; of provenance and its options, their members that do."""
     found = {}
     for name in documents[0] if documents else ():
         if not all(name in document for document in documents):
             continue
         values = [document[name] for document in documents]
-        if name == "provenance":
+        if name in PARTLY_AGREED:
             found[name] = _agreed(values)
         elif all(value == values[0] for value in values):
             found[name] = values[0]

@@ -224,6 +224,11 @@ def test_files_that_do_not_make_up_a_clip_are_refused(clip, scenes, tmp_path, ca
     ):
         assert kpjoin.main([*(str(tmp_path / f"{name}.kpc") for name in names), "-o", str(output)]) == code
         assert complaint in capsys.readouterr().err and not output.exists()
+    damaged = bytearray(scenes[0])
+    damaged[-3] ^= 1
+    with pytest.raises(FormatError, match="is damaged"):
+        groups.write([GroupInput.of(bytes(damaged), 0)], output)
+    assert not output.exists()
     before = clip.read_bytes()
     assert kpjoin.main([str(clip), str(slower), "-o", str(clip)]) == 2 and clip.read_bytes() == before
     with pytest.raises(UsageError, match="leave no frame out"):

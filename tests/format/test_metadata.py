@@ -20,7 +20,14 @@ from kpc.format.container.metadata_chunk import pack_metadata, parse_metadata
 from kpc.format.container.metadata_options import add_metadata_options, members_from
 from kpc.format.container.partial import PartialScene
 from kpc.format.container.scene_io import SceneReader, read
-from kpc.format.scene.metadata import Metadata, camera_document, camera_from, limits_document, merged
+from kpc.format.scene.metadata import (
+    Metadata,
+    camera_document,
+    camera_from,
+    differences,
+    limits_document,
+    merged,
+)
 from kpc.tools.vectors.metadata_vectors import FULL
 from scenes import tiny_scene
 
@@ -87,6 +94,16 @@ def test_merging_leaves_out_what_some_lack():
     assert {"licence", "provenance"} <= FULL.keys() and "held_out" in FULL["provenance"]
     assert "licence" not in found.document and "held_out" not in found.provenance
     assert merged([METADATA, Metadata()]).document.keys() == {"opening"}
+
+
+def test_merging_keeps_the_options_that_all_parts_share_and_names_the_others():
+    one, other = (
+        METADATA.with_members(title=title, view_limits=None).with_provenance(options={"max_loss_db": 0.15, **options})
+        for title, options in (("One", {"steps": 6000}), ("Other", {"steps": 8000, "downscale": 2}))
+    )
+    assert merged([one, other]).provenance["options"] == {"max_loss_db": 0.15}
+    assert differences([one, other]) == ["title", "option steps", "option downscale"]
+    assert differences([one, one]) == [] and "held-out quality" in differences([one, Metadata()])
 
 
 def test_merging_keeps_the_view_limits_that_hold_in_all_parts():

@@ -1,6 +1,8 @@
 """Times, alpha, exposure and interruption of what kprender writes."""
 
+import argparse
 import itertools
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,11 +10,12 @@ import numpy as np
 import pytest
 
 import kpc
+from kpc.format.common.errors import MediaError
 from kpc.format.common.images import read_image
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
 from kpc.tools.cli import kprender
-from kpc.tools.rendering import content
+from kpc.tools.rendering import content, pictures, resuming
 from kpc.tools.rendering.options import parser
 from kpc.tools.rendering.resuming import RECORD
 from kpc.tools.rendering.shots import shots_of
@@ -177,9 +180,7 @@ def test_the_camera_of_a_path_moves_while_the_shutter_is_open(scene_file: Path, 
     assert (steps > 0).all() and steps.sum() == pytest.approx(whole * 7 / 8, rel=0.05)
 
 
-def test_resuming_skips_whole_pictures_of_this_size(
-    run: Run, scene_file: Path, tmp_path: Path, times: list[float]
-) -> None:
+def test_resuming_skips_whole_pictures(run: Run, scene_file: Path, tmp_path: Path, times: list[float]) -> None:
     out = tmp_path / "out"
     words = [scene_file, "--frames", "0-5", "--depth", *SIZE, "--resume", "-o", out]
     assert run(*words)[0] == 0 and len(times) == 6
@@ -192,8 +193,6 @@ def test_resuming_skips_whole_pictures_of_this_size(
     code, printed, _ = run(*words)
     assert code == 0 and "6 pictures (2 were there)" in printed
     assert times == pytest.approx([0.1, 0.2, 0.3, 0.4]) and (out / "0001.png").read_bytes() == whole
-    times.clear()
-    assert run(*words[:-1], out, "--size", "12x9")[0] == 0 and len(times) == 6  # another size
 
 
 @pytest.mark.parametrize(
@@ -203,6 +202,7 @@ def test_resuming_skips_whole_pictures_of_this_size(
         (["--static-only"], "what is shown"),
         (["--samples", "2"], "--samples"),
         (["--camera", "0"], "--camera"),
+        (["--size", "12x9"], "--size"),  # whole pictures of a long run are not replaced
     ],
 )
 def test_resuming_with_other_options_is_refused(
@@ -214,6 +214,18 @@ def test_resuming_with_other_options_is_refused(
     code, _, printed = run(*words, "--frames", "0-2", "--resume", *more)
     assert code == 2 and f"another value of {named}" in printed
     assert not (tmp_path / "out" / "0002.png").exists()
+
+
+def test_resuming_knows_a_scene_by_its_content_and_keeps_no_secret(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert run(scene_file, *SIZE, "--frames", "0-0", "-o", out)[0] == 0
+    renamed = shutil.copy(scene_file, tmp_path / "renamed.kpc")
+    assert run(renamed, *SIZE, "--frames", "0-1", "--resume", "-o", out)[0] == 0
+    (out / RECORD).unlink()
+    code, _, printed = run(renamed, *SIZE, "--frames", "0-1", "--resume", "-o", out)
+    assert code == 2 and "what they show is not known" in printed
+    described = resuming._described(argparse.Namespace(scene="https://user:password@host/a.kpc?token=secret"))
+    assert described["scene"].startswith("https://host/a.kpc, address of SHA-256 ") and len(described["scene"]) < 70
 
 
 def test_resuming_tells_black_from_transparent(run: Run, scene_file: Path, tmp_path: Path) -> None:
@@ -286,3 +298,16 @@ def test_an_odd_size_is_padded_and_said(run: Run, scene_file: Path, tmp_path: Pa
     assert code == 0 and "padded to 34x18" in printed and "needs even sides" in notes
     code, printed, notes = run(*words, "-o", tmp_path / "x.mov", "--background", "transparent")
     assert code == 0 and "(padded" not in printed and "33x17" in printed
+
+
+def test_an_exr_that_cannot_be_written_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import OpenEXR
+
+    def fail(self: object, name: str) -> None:
+        raise RuntimeError(f'Failed to write pixel data to image file "{name}". No space left on device.')
+
+    monkeypatch.setattr(OpenEXR.File, "write", fail)
+    seen = reference.Rendering(*(np.ones((2, 3, 3), np.float32), *np.ones((3, 2, 3), np.float32)))
+    with pytest.raises(MediaError, match=r"a\.exr: cannot be written \(.*/a\.exr\". No space left on device\)$"):
+        pictures.write_picture(tmp_path / "a.exr", seen, False, None)
+    assert not list(tmp_path.iterdir())

@@ -26,7 +26,6 @@ import sys
 from pathlib import Path
 
 from kpc.format.common import cli
-from kpc.format.common.errors import UsageError
 from kpc.tools.bench import coding_commands, encoding_commands, playing_commands, tables
 from kpc.tools.bench.provenance import commit, machine, versions
 from kpc.tools.bench.records import Record, as_json
@@ -46,8 +45,8 @@ def _command(argv: list[str]) -> None:
         "versions": versions(),
     }
     out: Path | None = options.out
-    if out is not None and not out.absolute().parent.is_dir():
-        raise UsageError(f"--out {out}: no such folder; make it first")
+    if out is not None:
+        cli.check_writable(out)
     records: list[Record] = []
     try:
         for record in options.measure(options, origin):

@@ -49,6 +49,7 @@ def _command(argv: list[str]) -> None:
     options = _parser().parse_args(cli.join_values(argv, "--box", "--move", "--up"))
     if options.output.exists() and options.output.samefile(options.scene):
         raise UsageError(f"{options.output}: is the input, too; choose another output with -o")
+    cli.check_writable(options.output)
     edits, groups = _edits_from(options), Groups(options.scene)
     if edits.speed is not None and has_sound(groups):
         print("kpedit: the sound is left out, since it belongs to the speed of the source", file=sys.stderr)

@@ -12,8 +12,6 @@ metadata, if there are any.
 """
 
 import argparse
-import errno
-import os
 import sys
 import time as clock
 from pathlib import Path
@@ -51,9 +49,7 @@ def main(argv: list[str] | None = None) -> int:
 def _command(argv: list[str]) -> None:
     options = parser().parse_args(argv)
     task = task_of(options)
-    parent = Path(options.output).absolute().parent
-    if not parent.is_dir() and not task.is_folder:
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(parent))
+    cli.check_writable(Path(options.output), is_folder=task.is_folder)
     if task.kind == "geometry":
         _export_geometry(task, options)
     elif task.kind == "cameras":

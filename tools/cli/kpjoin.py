@@ -16,6 +16,7 @@ from pathlib import Path
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.container import groups
+from kpc.format.scene.metadata import camera_document, differences
 from kpc.tools.editing.clips import Edits, edit
 
 
@@ -43,9 +44,11 @@ def _command(argv: list[str]) -> None:
     )
     options = parser.parse_args(argv)
     if len(options.scenes) < 2:
-        raise UsageError(f"{options.scenes[0]}: a single file cannot be joined; give two or more")
+        what = "is a folder" if options.scenes[0].is_dir() else "a single file cannot be joined"
+        raise UsageError(f"{options.scenes[0]}: {what}; give two or more files")
     if options.output.exists() and any(options.output.samefile(scene) for scene in options.scenes):
         raise UsageError(f"{options.output}: is one of the inputs; choose another output with -o")
+    cli.check_writable(options.output)
     with tempfile.TemporaryDirectory(dir=options.output.parent) as folder:
         parts = groups.group_inputs(options.scenes)
         groups.check_parts(parts)
@@ -54,7 +57,16 @@ def _command(argv: list[str]) -> None:
         size = groups.write(parts, options.output)
     clip = groups.Timeline(tuple(part.span for part in parts), parts[0].fps).clip
     duration = f"{clip.frame_count:,} frames at {clip.fps:g} fps, {clip.total_s:.2f} s"
+    if differing := differences([part.metadata for part in parts]):
+        print(f"kpjoin: the files differ, so the clip has no {', '.join(differing)}", file=sys.stderr)
+    if _cameras_differ(options.scenes):
+        print("kpjoin: the files have different cameras; those of the first stand for the clip", file=sys.stderr)
     print(f"{options.output}: {size:,} bytes, {len(parts)} groups, {duration}")
+
+
+def _cameras_differ(scenes: Sequence[Path]) -> bool:
+    first, *others = ([camera_document(camera) for camera in groups.Groups(scene).cameras()] for scene in scenes)
+    return any(one != first for one in others)
 
 
 def _at_rate(scenes: Sequence[Path], fps: float, folder: Path) -> list[Path]:

@@ -15,9 +15,7 @@ The player saves files for --cameras and --path.
 """
 
 import argparse
-import errno
 import functools
-import os
 import sys
 import tempfile
 import time as clock
@@ -53,8 +51,7 @@ def _command(argv: list[str]) -> None:
     options = parser().parse_args(argv)
     output = Output.of(options.output, options.format)
     film = _film_format(output, options)
-    if not output.is_folder and not output.path.absolute().parent.is_dir():
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(output.path.absolute().parent))
+    cli.check_writable(output.path, is_folder=output.is_folder)
     is_transparent = _resolve_background(output, options)
     loaded = kpc.load(options.scene)
     scene, _ = loaded.at(0.0)  # the first group of a long clip has the cameras and bounds of all

@@ -39,6 +39,7 @@ def _command(argv: list[str]) -> None:
     files = [Path(name) for name in Playlist.named([str(path) for path in _inputs(options)]).files]
     is_gallery = options.gallery is not None or len(files) > 1
     folder = options.output
+    cli.check_writable(folder, is_folder=True)
     site.check_folder(folder)
     names = site.distinct_names([file.stem for file in files])
     folders = [folder / name if is_gallery else folder for name in names]
@@ -96,8 +97,6 @@ def _inputs(options: argparse.Namespace) -> list[Path]:
     inputs = [*options.scenes, *([] if options.gallery is None else [options.gallery])]
     if not inputs:
         raise UsageError("no scene is given; name a .kpc file, or a folder of them with --gallery")
-    if options.output.exists() and not options.output.is_dir():
-        raise UsageError(f"-o {options.output}: is a file; give a folder")
     if options.title is not None and options.gallery is None and len(inputs) == 1 and not inputs[0].is_dir():
         raise UsageError("--title: a page of one scene has the scene's own title, which kpedit --title sets")
     return inputs

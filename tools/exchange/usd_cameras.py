@@ -16,7 +16,7 @@ import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom
 
 from kpc.format.common.cli import atomic_write
-from kpc.format.common.errors import DatasetError
+from kpc.format.common.errors import DatasetError, MediaError
 from kpc.format.scene.camera_checks import check_lens, check_pose
 from kpc.format.scene.cameras import Camera, View
 from kpc.tools.exchange.camera_tracks import MAX_VIEWS, Track, size_for
@@ -33,6 +33,9 @@ def write_usd_cameras(path: Path, tracks: Sequence[Track], fps: float) -> None:
         path: of the file; .usda is text.
         tracks: the cameras.
         fps: time codes per second.
+
+    Raises:
+        MediaError, OSError: the file cannot be written.
     """
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -53,7 +56,11 @@ def write_usd_cameras(path: Path, tracks: Sequence[Track], fps: float) -> None:
         used.add(name)
         _define(UsdGeom.Camera.Define(stage, f"/cameras/{name}"), track, fps)
     with atomic_write(path) as aside:
-        stage.GetRootLayer().Export(str(aside))
+        try:
+            stage.GetRootLayer().Export(str(aside))
+        except Tf.ErrorException as error:
+            reasons = re.findall(r": '(.*)'", str(error))
+            raise MediaError(f"{path}: cannot be written ({(reasons or ['no reason given'])[0]})") from error
 
 
 def read_usd_cameras(path: Path, size: tuple[int, int] | None) -> tuple[list[Track], list[str]]:

@@ -184,7 +184,9 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
         f"{PICTURE_FORMATS[0]})",
     )
     group.add_argument(
-        "--resume", action="store_true", help="skip pictures that are in the folder already, complete and of this size"
+        "--resume",
+        action="store_true",
+        help="skip pictures that are in the folder already and whole, of the same options",
     )
     group.add_argument(
         "--codec",

@@ -95,7 +95,11 @@ def _write_exr(path: Path, picture: Rendering, is_transparent: bool) -> None:
         cli.atomic_write(path) as aside,
         OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as exr,
     ):
-        exr.write(str(aside))
+        try:
+            exr.write(str(aside))
+        except RuntimeError as error:
+            reason = str(error).replace(str(aside), str(path))
+            raise MediaError(f"{path}: cannot be written ({reason.rstrip('.')})") from error
 
 
 def max_depth(scene: Scene, cameras: Sequence[Camera]) -> float:

@@ -11,11 +11,13 @@ import numpy as np
 
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import UsageError
+from kpc.format.container.http_address import Address, is_url
 
 RECORD = "kprender.json"
 # Options that do not change what a picture shows: they choose pictures, or concern other outputs. A picture of another
-# size or format is rendered anew, or is another file.
-FREE = {"output", "resume", "start_s", "end_s", "frames", "step", "format", "size", "codec", "crf", "bits"}
+# format is another file.
+FREE = {"output", "resume", "start_s", "end_s", "frames", "step", "format", "codec", "crf", "bits"}
+CHECKSUM = "SHA-256 "
 PICTURES = {".png", ".jpg", ".jpeg", ".exr"}
 # Options whose name on the command line differs from that of their value.
 NAMES = {"content": "what is shown", "part": "--diagnose", "scene": "the scene"}
@@ -34,7 +36,8 @@ def begin(folder: Path, options: argparse.Namespace, is_transparent: bool, paths
         paths: of the pictures to render.
 
     Raises:
-        UsageError: `--resume` is given, and pictures that are there were rendered with other options.
+        UsageError: `--resume` is given, and pictures that are there were rendered with other options, or nobody knows
+            with which.
     """
     now = _described(options)
     if is_transparent:
@@ -47,7 +50,7 @@ def begin(folder: Path, options: argparse.Namespace, is_transparent: bool, paths
             if options.resume:
                 raise UsageError(f"--resume: {record} cannot be read; delete it, or render without --resume") from error
             before = {}
-        changed = [name for name in now if before.get(name) != now[name]]
+        changed = [name for name in now if _identity(before.get(name)) != _identity(now[name])]
         if changed and options.resume:
             name = changed[0]
             what = NAMES.get(name, "--" + name.replace("_", "-"))
@@ -60,12 +63,17 @@ def begin(folder: Path, options: argparse.Namespace, is_transparent: bool, paths
                 path.unlink(missing_ok=True)
             if any(path.suffix in PICTURES for path in folder.iterdir()):
                 now |= dict.fromkeys(changed, "various")
+    elif options.resume and any(path.exists() for path in paths):
+        raise UsageError(
+            f"--resume: {folder} holds pictures and no {RECORD}, so what they show is not known; delete them, or give "
+            "another folder with -o"
+        )
     with atomic_write(record) as temporary:
         temporary.write_text(json.dumps(now, indent=1) + "\n")
 
 
 def _described(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the options that pictures depend on, as JSON values; files count by their content."""
+    """Return the options that pictures depend on, as JSON values without what is secret; files count by content."""
     found = {}
     for name, value in sorted(vars(options).items()):
         if name in FREE:
@@ -73,9 +81,21 @@ def _described(options: argparse.Namespace) -> dict[str, Any]:
         if isinstance(value, np.ndarray):
             value = [float(number) for number in value]
         elif isinstance(value, str | Path) and Path(value).is_file():
-            value = f"{Path(value).name}, SHA-256 {hashlib.sha256(Path(value).read_bytes()).hexdigest()[:16]}"
+            value = f"{Path(value).name}, {_checksum(Path(value).read_bytes())}"
+        elif isinstance(value, str) and is_url(value):
+            address = Address.parse(value)  # the query may say which scene it is; user and password do not
+            value = f"{address.name}, address of {_checksum(address.url.encode())}"
         found[name] = value if isinstance(value, int | float | list | None) else str(value)
     return found
+
+
+def _checksum(content: bytes) -> str:
+    return f"{CHECKSUM}{hashlib.sha256(content).hexdigest()[:16]}"
+
+
+def _identity(value: Any) -> Any:
+    """Return what tells one value from another: of files their content, since they may be renamed."""
+    return value[value.index(CHECKSUM) :] if isinstance(value, str) and CHECKSUM in value else value
 
 
 def _shown(value: Any) -> str:
