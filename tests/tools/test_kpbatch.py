@@ -329,9 +329,14 @@ def test_parts_of_a_clip_are_joined(tmp_path: Path) -> None:
     store = Store(str(tmp_path))
     for number in range(2):
         store.put(SAMPLE, f"key{number}/{SCENE}")
+        store.put_json(
+            {"test_psnr": 30.0 + 4 * number, "test_pictures": 3 - 2 * number, "steps": 5}, f"key{number}/{RESULT}"
+        )
     joined = Task("joined", "clip", "clip", "join", before=("key0", "key1"))
     outcome = working.run(joined, Place(str(tmp_path), str(tmp_path / "scratch")))
     assert outcome.is_done and outcome.figures["groups"] == 2, outcome.error
+    assert outcome.figures["test_psnr"] == 31.0 and outcome.figures["steps"] == 10
+    assert outcome.figures["test_ssim"] is None
     assert not list((tmp_path / "scratch/kpbatch").glob("task-*"))
 
 

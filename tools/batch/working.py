@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,9 @@ POLL_S = 0.25
 LAST_LINES = 4
 # Files of a work folder that other workers make by themselves.
 LOCAL_FILES = ("pixels-*", ".*", "*.lock")
+# Figures of groups that are averaged over their tested pictures, and those that are added up.
+MEANS = ("test_psnr", "test_psnr_moving", "test_psnr_still", "test_ssim")
+SUMS = ("test_pictures", "steps", "train_s", "coding_s", "encode_s")
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 # What is told of a task that runs: percent done, seconds left, and PSNR, as far as they are known.
@@ -83,10 +86,10 @@ def _run_in(folder: Path, task: Task, store: Store, place: Place, report: Report
             store.get(f"{key}/{SCENE}", part)
         if len(parts) == 1:
             parts[0].rename(scene)
-            figures: dict[str, Any] = {}
         else:
-            figures = _child(["kpjoin", *map(str, parts), "-o", str(scene)], task, folder, store, report)
-        figures |= {"size_bytes": scene.stat().st_size, "groups": len(parts)}
+            _child(["kpjoin", *map(str, parts), "-o", str(scene)], task, folder, store, report)
+        figures = combine([store.get_json(f"{key}/{RESULT}") for key in task.before])
+        figures["size_bytes"] = scene.stat().st_size
     else:
         for key in task.before:
             store.get_folder(f"{key}/{WORK}", work)
@@ -104,6 +107,16 @@ def _run_in(folder: Path, task: Task, store: Store, place: Place, report: Report
     if scene.exists():
         store.put(scene, f"{task.key}/{SCENE}")
     return figures
+
+
+def combine(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return figures of a clip from those of its groups: means over tested pictures, and sums of times."""
+    found: dict[str, Any] = {"groups": len(parts)}
+    for name in MEANS:
+        known = [part for part in parts if part.get(name) is not None and part.get("test_pictures")]
+        pictures = sum(part["test_pictures"] for part in known)
+        found[name] = sum(part["test_pictures"] * part[name] for part in known) / pictures if pictures else None
+    return found | {name: sum(part.get(name) or 0 for part in parts) for name in SUMS}
 
 
 def _child(command: list[str], task: Task, folder: Path, store: Store, report: Report) -> dict[str, Any]:
