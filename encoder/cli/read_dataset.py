@@ -1,19 +1,27 @@
 """Read the dataset of an encode; of footage without poses, find the cameras and clocks first."""
 
+import json
+import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.work_folder import POSES
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.datasets.loading import has_layout
+from kpc.encoder.poses.footage import find_footage
 from kpc.format.common.media_files import is_hidden, is_image, is_video
+
+# The file beside found cameras that says what they were found from.
+ASKED = "asked.json"
 
 
 def read_dataset(options: Options) -> Dataset:
     """Decode the dataset that the options name.
 
-    Cameras that were found are kept in the work folder, and not looked for again.
+    Cameras that were found are kept in the work folder, and not looked for again unless the footage or the
+    options about it changed.
 
     Raises:
         DatasetError, MediaError: the dataset cannot be used, or its cameras cannot be found.
@@ -21,10 +29,11 @@ def read_dataset(options: Options) -> Dataset:
     root, transforms = options.source, None
     if not has_layout(root) and _has_footage(root):
         file = options.work_dir / POSES / "transforms.json"
-        if not file.exists():
-            _find_poses(options, file)
-        else:
+        changed = _what_changed(options, file)
+        if changed is None:
             print(f"cameras: those found before, {file}", file=sys.stderr)
+        else:
+            _find_poses(options, file, changed)
         is_own = (file.parent / "images").is_dir()  # the frames of a moving camera lie beside the document
         root, transforms = (file.parent, None) if is_own else (root, file)
     return load_dataset(
@@ -40,13 +49,40 @@ def _has_footage(root: Path) -> bool:
     return any(is_video(file) or is_image(file) for folder in folders for file in folder.iterdir())
 
 
-def _find_poses(options: Options, file: Path) -> None:
+def _what_changed(options: Options, file: Path) -> str | None:
+    """Return why cameras that were found before cannot be used again; None if they can."""
+    try:
+        before = json.loads((file.parent / ASKED).read_text())
+    except (OSError, ValueError):
+        before = None
+    if not isinstance(before, dict) or not file.exists():
+        return "has no poses"
+    different = [name for name, value in _asked(options).items() if before.get(name) != value]
+    return f"{different[0]} changed since the cameras were found" if different else None
+
+
+def _asked(options: Options) -> dict[str, Any]:
+    """Return what found cameras depend on: the files, and what the user says about them."""
+    wishes = options.wishes
+    given = wishes.sync.read_text(errors="replace") if isinstance(wishes.sync, Path) and wishes.sync.is_file() else ""
+    files = [file for one in find_footage(options.source) for file in one.files]
+    return {
+        "--rig": wishes.rig,
+        "--sync": [str(wishes.sync), given],
+        "--distance": wishes.distance and list(wishes.distance),
+        "the footage": [[str(file), file.stat().st_size, file.stat().st_mtime] for file in files],
+    }
+
+
+def _find_poses(options: Options, file: Path, why: str) -> None:
     from kpc.encoder.cli.kpposes import report  # needs packages that other encodes do not
     from kpc.encoder.poses.document import write_document
     from kpc.encoder.poses.find import find_poses
 
-    print(f"{options.source}: has no poses; finding the cameras", file=sys.stderr)
+    print(f"{options.source}: {why}; finding the cameras", file=sys.stderr)
     found = find_poses(options.source, options.wishes)
-    file.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(file.parent, ignore_errors=True)
+    file.parent.mkdir(parents=True)
     write_document(found, options.source, file)
+    (file.parent / ASKED).write_text(json.dumps(_asked(options)))
     print(report(found), file=sys.stderr)

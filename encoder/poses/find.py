@@ -10,6 +10,7 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.poses.footage import Footage, find_footage
+from kpc.encoder.poses.given_clocks import read_clocks
 from kpc.encoder.poses.instants import Picture, grey_of, moving_pictures, still_pictures
 from kpc.encoder.poses.orientation import extent, oriented
 from kpc.encoder.poses.structure import MANY, Pairing, PlacedView, Structure, reconstruct
@@ -111,9 +112,12 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
             f"{root}: {len(footage)} camera{'s' * (len(footage) > 1)} that stand still: depth needs {LEAST_CAMERAS} or "
             "more; film with more cameras, or walk around with one"
         )
-    clocks = synchronise(footage, surveys, wishes.sync)
-    best: Structure | None = None
     names = [one.name for one in footage]
+    if isinstance(wishes.sync, str):
+        clocks = synchronise(footage, surveys, wishes.sync)
+    else:
+        clocks = read_clocks(wishes.sync, names)
+    best: Structure | None = None
     lenses = _lenses([seen.median.shape for seen in surveys])
     for features, instants in ATTEMPTS:
         pictures = [*still_pictures(surveys), *moving_pictures(footage, surveys, clocks, instants)]

@@ -3,6 +3,7 @@
 import argparse
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 RIGS = ("auto", "still", "moving")
 SYNC_MODES = ("auto", "audio", "motion", "none")
@@ -14,20 +15,20 @@ class Wishes:
 
     Attributes:
         rig: one of RIGS: whether cameras move.
-        sync: one of SYNC_MODES: how videos are brought in step.
+        sync: one of SYNC_MODES: how videos are brought in step; or a file of offsets (`given_clocks`).
         distance: two cameras' names, and how far apart they are in metres; None if unknown.
         require_all: whether to refuse if a camera cannot be placed.
     """
 
     rig: str = "auto"
-    sync: str = "auto"
+    sync: str | Path = "auto"
     distance: tuple[str, str, float] | None = None
     require_all: bool = False
 
     def changed(self) -> dict[str, str]:
         """Return what differs from the defaults and may change the cameras, as text by the names of options."""
         distance = None if self.distance is None else "{},{}={:g}".format(*self.distance)
-        given = {"rig": self.rig, "sync": self.sync, "distance": distance}
+        given = {"rig": self.rig, "sync": str(self.sync), "distance": distance}
         return {name: value for name, value in given.items() if value not in ("auto", None)}
 
 
@@ -41,7 +42,11 @@ def add_pose_options(parser: argparse.ArgumentParser) -> None:
         help="whether cameras move; moving: images are the frames of one camera (default: %(default)s)",
     )
     group.add_argument(
-        "--sync", choices=SYNC_MODES, default=Wishes.sync, help="how videos are brought in step (default: %(default)s)"
+        "--sync",
+        type=_sync,
+        metavar="{" + ",".join(SYNC_MODES) + ",JSON}",
+        default=Wishes.sync,
+        help="how videos are brought in step, or a file of their offsets (default: %(default)s)",
     )
     group.add_argument(
         "--distance",
@@ -55,6 +60,14 @@ def add_pose_options(parser: argparse.ArgumentParser) -> None:
 def wishes_from(given: argparse.Namespace) -> Wishes:
     """Return what parsed options say."""
     return Wishes(given.rig, given.sync, given.distance, given.require_all)
+
+
+def _sync(text: str) -> str | Path:
+    if text in SYNC_MODES:
+        return text
+    if not text.lower().endswith(".json"):
+        raise argparse.ArgumentTypeError(f"{text!r} is none of {', '.join(SYNC_MODES)}, and no .json file")
+    return Path(text)
 
 
 def _distance(text: str) -> tuple[str, str, float]:

@@ -15,7 +15,8 @@ from videos import film
 pytest.importorskip("pycolmap", reason="needs pycolmap, of the extra poses")
 pytest.importorskip("scipy", reason="needs scipy, of the extra poses")
 
-from kpc.encoder.cli import kpposes
+from kpc.encoder.cli import kpposes, read_dataset
+from kpc.encoder.cli.options import parse
 from kpc.encoder.poses.orientation import looked_at, up_direction
 
 LATE = (0, 7, 0, 3, 12)  # frames
@@ -143,6 +144,36 @@ def test_what_cannot_be_matched_is_named(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "0 of 3 cameras could be placed, too few: a (matches none)" in said
     assert not (tmp_path / "transforms.json").exists()
+
+
+def test_cameras_are_found_anew_if_what_they_depend_on_changes(tmp_path, monkeypatch, capsys):
+    (tmp_path / "set").mkdir()
+    for name in ("a", "b", "c"):
+        film(tmp_path / "set" / f"{name}.mp4")
+    offsets = tmp_path / "offsets.json"
+    offsets.write_text('{"a": 1}')
+
+    def said(*options: str) -> str:
+        words = [str(tmp_path / "set"), "-o", str(tmp_path / "x.kpc"), *options]
+        with pytest.raises(DatasetError, match="stopped here"):
+            read_dataset.read_dataset(parse(words)[0])
+        return capsys.readouterr().err
+
+    def stop(*_: object, **__: object) -> None:
+        raise DatasetError("stopped here")
+
+    monkeypatch.setattr("kpc.encoder.poses.find.find_poses", lambda *_: None)
+    monkeypatch.setattr("kpc.encoder.poses.document.write_document", lambda _, __, file: file.write_text("{}"))
+    monkeypatch.setattr("kpc.encoder.cli.kpposes.report", lambda _: "")
+    monkeypatch.setattr(read_dataset, "load_dataset", stop)
+    sync = ("--sync", str(offsets))
+    assert "has no poses; finding the cameras" in said(*sync)
+    assert "cameras: those found before" in said(*sync)
+    offsets.write_text('{"a": 2}')
+    assert "--sync changed since the cameras were found; finding" in said(*sync)
+    assert "--distance changed" in said(*sync, "--distance", "a,b=2")
+    film(tmp_path / "set" / "d.mp4")
+    assert "the footage changed" in said(*sync, "--distance", "a,b=2")
 
 
 def test_cameras_are_named_by_their_folders(tmp_path):

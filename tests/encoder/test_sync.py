@@ -5,8 +5,12 @@ import itertools
 import numpy as np
 import pytest
 
+from kpc.format.common.errors import DatasetError
+
 sound_sync = pytest.importorskip("kpc.encoder.poses.sound_sync", reason="needs scipy")
 motion_sync = pytest.importorskip("kpc.encoder.poses.motion_sync", reason="needs scipy")
+
+given_clocks = pytest.importorskip("kpc.encoder.poses.given_clocks", reason="needs scipy")
 
 RATE = 48000
 
@@ -81,3 +85,41 @@ def test_a_wrong_pair_does_not_move_the_others():
     start = sync._spanning_offsets(pairs, set())
     found = sync._agreed_offsets(pairs, start, set(), 0.5 / 30)
     assert [found[number] - found[0] for number in range(4)] == pytest.approx(true, abs=0.01)
+
+
+NAMES = ("cam00", "cam01", "cam02")
+
+
+def test_given_clocks_are_read(tmp_path, capsys):
+    file = tmp_path / "offsets.json"
+    file.write_text('{"cam01": 0.4, "cam02": {"offset_s": -0.12, "rate": 1.00002}}')
+    clocks = given_clocks.read_clocks(file, NAMES)
+    assert [(clock.offset_s, clock.rate) for clock in clocks] == [(0.0, 1.0), (0.4, 1.0), (-0.12, 1.00002)]
+    assert [clock.method for clock in clocks] == ["none", "given", "given"]
+    assert "does not name cam00" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("{", "not JSON"),
+        ("[1, 2, 3]", "no object with an offset for each camera"),
+        ("{}", "no object with an offset for each camera"),
+        ('{"cam07": 1}', "names cameras that are not there: cam07"),
+        ('{"cam00": 1, "cam00": 2}', "is there twice"),
+        ('{"cam00": "1"}', "offset_s is no number"),
+        ('{"cam00": true}', "offset_s is no number"),
+        ('{"cam00": NaN}', "is that of no clock"),
+        ('{"cam00": 1' + "0" * 400 + "}", "is that of no clock"),
+        ('{"cam00": {"rate": 30}}', "is that of no clock"),
+        ('{"cam00": {"offset": 1}}', "unknown keys offset"),
+        (None, "no such file"),
+    ],
+)
+def test_what_is_no_clock_is_refused(tmp_path, text, said):
+    file = tmp_path / "offsets.json"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(DatasetError, match=said) as error:
+        given_clocks.read_clocks(file, NAMES)
+    assert str(error.value).isprintable()
