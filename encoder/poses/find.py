@@ -115,6 +115,7 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
     names = [one.name for one in footage]
     if isinstance(wishes.sync, str):
         clocks = synchronise(footage, surveys, wishes.sync)
+        _warn_of_unknown(root, names, clocks)
     else:
         clocks = read_clocks(wishes.sync, names)
     best: Structure | None = None
@@ -132,6 +133,17 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
         )
     assert best is not None
     return Found("still rig", footage, tuple(clocks), tuple(names), best, False)
+
+
+def _warn_of_unknown(root: Path, names: Sequence[str], clocks: Sequence[Clock]) -> None:
+    """Name the cameras whose clocks could not be found, if others' could."""
+    unknown = [name for name, clock in zip(names, clocks, strict=True) if clock.method == "none"]
+    if unknown and len(unknown) < len(names):
+        print(
+            f"{root}: warning: the clocks of {first_names(unknown)} could not be found and are left as they are; film "
+            "a clap that all cameras see and hear, or give their offsets with --sync offsets.json",
+            file=sys.stderr,
+        )
 
 
 def _find_moving_camera(root: Path, footage: Footage) -> Found:

@@ -18,9 +18,13 @@ BANDS_HZ = np.geomspace(200.0, 8000.0, 17)
 WINDOW_S = 8.0  # of onsets that are looked for in the other track
 # A window is found if its correlation exceeds the mean by so many standard deviations.
 FOUND = 6.0
+# A track of no more than one window is tried at so many of the highest correlations,
+# and with these rates, of 29.97 frames for 30, since it is too short to show its rate.
+CANDIDATES, RATES = 8, (1.0, 1000 / 1001, 1001 / 1000)
 DRIFT_LIMIT = 0.02  # seconds a second
 
-PIECE_S, REACH_S = 1.0, 0.04  # of the samples that are compared, and how far they are shifted
+# Pieces of the samples that are compared are so long, or a third of a shorter overlap, and shifted so far.
+PIECE_S, LEAST_PIECE_S, REACH_S = 1.0, 0.15, 0.04
 PIECES = 40  # at most, along the clip
 AGREES_S = 0.002  # from the line through the pieces
 # Drift is believed if it amounts to so much over the clip; less is an error of measurement.
@@ -47,10 +51,12 @@ NOTHING = Alignment(0.0, 1.0, 0.0)
 
 def align_sound(reference: np.ndarray, other: np.ndarray) -> Alignment:
     """Align two tracks of one channel, (N,) float32 at SAMPLE_RATE."""
-    coarse = _align_onsets(onsets(reference), onsets(other))
-    if coarse is None:
-        return NOTHING
-    aligned = _align_pieces(reference, other, *coarse)
+    candidates = _align_onsets(onsets(reference), onsets(other))
+    aligned = max(
+        (_align_pieces(reference, other, offset_s, rate) for offset_s, rate in candidates),
+        key=lambda found: found.confidence,
+        default=NOTHING,
+    )
     return aligned if aligned.rate == 1 else _align_pieces(reference, other, aligned.offset_s, aligned.rate)
 
 
@@ -64,7 +70,7 @@ def _align_pieces(reference: np.ndarray, other: np.ndarray, offset_s: float, rat
         slope = 0.0
     start = float(np.median(offsets - slope * times))
     agreeing = np.abs(offsets - slope * times - start) <= AGREES_S
-    if not agreeing.any():
+    if agreeing.sum() < 3:
         return NOTHING
     if slope:
         slope, start = np.polyfit(times[agreeing], offsets[agreeing], 1)
@@ -85,11 +91,16 @@ def onsets(samples: np.ndarray) -> np.ndarray:
     return np.maximum(np.diff(np.log(bands + floor), axis=1), 0).sum(0)
 
 
-def _align_onsets(reference: np.ndarray, other: np.ndarray) -> tuple[float, float] | None:
-    """Return offset in seconds and rate by windows of onsets; None if no window is found."""
+def _align_onsets(reference: np.ndarray, other: np.ndarray) -> list[tuple[float, float]]:
+    """Return offsets in seconds and rates by windows of onsets: of a short track, the most likely ones."""
     length = min(len(other), int(WINDOW_S * SAMPLE_RATE / HOP))
     if length < 50 or len(reference) < 50:
-        return None
+        return []
+    if length == len(other):
+        found = signal.correlate(reference - reference.mean(), other - other.mean(), mode="full", method="fft")
+        peaks, _ = signal.find_peaks(found)
+        highest = peaks[np.argsort(-found[peaks])[:CANDIDATES]]
+        return [((int(peak) - (length - 1)) * HOP / SAMPLE_RATE, rate) for rate in RATES for peak in highest]
     times, lags, heights = [], [], []
     for start in range(0, len(other) - length + 1, max(length // 2, 1)):
         window = other[start : start + length] - other[start : start + length].mean()
@@ -101,25 +112,27 @@ def _align_onsets(reference: np.ndarray, other: np.ndarray) -> tuple[float, floa
         heights.append((found[peak] - found.mean()) / max(float(found.std()), 1e-12))
     good = np.array(heights) >= FOUND
     if not good.any():
-        return None
+        return []
     t, lag = np.array(times)[good], np.array(lags)[good]
     slope = float(stats.theilslopes(lag, t)[0]) if len(t) >= 3 else 0.0
     slope = slope if abs(slope) <= DRIFT_LIMIT else 0.0
-    return float(np.median(lag - slope * t)), 1.0 + slope
+    return [(float(np.median(lag - slope * t)), 1.0 + slope)]
 
 
 def _piece_offsets(
     reference: np.ndarray, other: np.ndarray, offset_s: float, rate: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the times of pieces of a track and the reference's time less theirs, both (N,) float64 in seconds."""
-    piece, reach = int(PIECE_S * SAMPLE_RATE), int(REACH_S * SAMPLE_RATE)
     first = max(0.0, (-offset_s + REACH_S) / rate)
-    last = min(len(other) / SAMPLE_RATE, (len(reference) / SAMPLE_RATE - offset_s - REACH_S) / rate) - PIECE_S
+    end = min(len(other) / SAMPLE_RATE, (len(reference) / SAMPLE_RATE - offset_s - REACH_S) / rate)
+    piece_s = min(max((end - first) / 3, LEAST_PIECE_S), PIECE_S)
+    last = end - piece_s
     if last <= first:
         return np.zeros(0), np.zeros(0)
+    piece, reach = int(piece_s * SAMPLE_RATE), int(REACH_S * SAMPLE_RATE)
     times, offsets = [], []
-    for time in np.linspace(first, last, min(PIECES, 1 + int((last - first) / (PIECE_S / 4)))):
-        middle = time + PIECE_S / 2
+    for time in np.linspace(first, last, min(PIECES, 1 + int((last - first) / (piece_s / 4)))):
+        middle = time + piece_s / 2
         there = round((offset_s + rate * middle) * SAMPLE_RATE - piece / 2)
         begin = max(there - reach, 0)
         its = reference[begin : there + piece + reach]
@@ -127,7 +140,8 @@ def _piece_offsets(
         if len(its) < piece or places[0] < 0 or places[-1] > len(other) - 1:
             continue
         low = int(places[0])
-        own = np.interp(places - low, np.arange(int(places[-1]) + 2 - low), other[low : int(places[-1]) + 2])
+        part = other[low : int(places[-1]) + 2]
+        own = np.interp(places - low, np.arange(len(part)), part)
         delay = _delay(its, own)
         if delay is not None:
             times.append(middle)

@@ -15,8 +15,8 @@ from kpc.encoder.poses.survey import Survey
 from kpc.format.common.progress import progress
 from kpc.format.scene.sound import SAMPLE_RATE
 
-# Alignments with less confidence are not used.
-LEAST_CONFIDENCE = 0.4
+# Alignments with less confidence are not used: shares of the pieces of sound, and of the pairs of curves, that agree.
+LEAST_AGREEING, LEAST_CONFIDENCE = 0.6, 0.4
 # Least correlation of two curves of motion, and least margin to any other offset, to be used.
 LEAST_CORRELATION, LEAST_MARGIN = 0.5, 0.02
 # Seconds of sound that are compared: of a longer recording, the beginning.
@@ -75,7 +75,7 @@ def _by_sound(footage: Sequence[Footage]) -> list[Clock]:
     clocks[reference] = Clock(0.0, 1.0, "reference", 1.0)
     for number in progress([n for n in tracks if n != reference], "aligning sound", unit="track"):
         found = align_sound(tracks[reference], tracks[number])
-        if found.confidence >= LEAST_CONFIDENCE:
+        if found.confidence >= LEAST_AGREEING:
             clocks[number] = Clock(found.offset_s, found.rate, "audio", found.confidence)
     return clocks if any(clock.method == "audio" for clock in clocks) else [UNKNOWN] * len(footage)
 

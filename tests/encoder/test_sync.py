@@ -46,6 +46,16 @@ def test_sound_gives_offset_and_drift_within_a_tenth_of_a_frame(offset_s, rate):
         assert found.offset_s + found.rate * time == pytest.approx(offset_s + rate * time, abs=0.1 / 30)
 
 
+@pytest.mark.parametrize("rate", [1.0, 1000 / 1001])
+def test_a_second_of_sound_is_aligned(rate):
+    samples = event(6.0)
+    reference = recorded(samples, 0.2, 1.0, 0.02, 2)[: 5 * RATE]
+    found = sound_sync.align_sound(reference, recorded(samples, 3.9, rate, 0.02, 3)[:RATE])
+    assert found.confidence > 0.6
+    for time in (0.0, 1.0):
+        assert found.offset_s + found.rate * time == pytest.approx(3.7 + rate * time, abs=0.1 / 30)
+
+
 def test_unlike_sounds_are_not_aligned():
     noise = [np.random.default_rng(seed).standard_normal(6 * RATE).astype(np.float32) for seed in (5, 6)]
     assert sound_sync.align_sound(*noise).confidence < 0.4
