@@ -14,6 +14,7 @@
     kpbench codec room.kpck liam.kpc --dataset room --dataset liam --out docs/bench/codec.json
     kpbench entropy room.kpc liam.kpc --out docs/bench/entropy.json
     kpbench decode room.kpc liam.kpc --out docs/bench/decode.json
+    kpbench compare old.json new.json
 
 Every record states what was run (commit, command, seed, settings), on what (machine, renderer, versions, SHA-256 of the
 data) and the result of every repeat; see `kpc.tools.bench.records`. The output is one JSON list: with --out it is
@@ -26,7 +27,7 @@ import sys
 from pathlib import Path
 
 from kpc.format.common import cli
-from kpc.tools.bench import coding_commands, encoding_commands, playing_commands, tables
+from kpc.tools.bench import coding_commands, compare, encoding_commands, playing_commands, tables
 from kpc.tools.bench.provenance import commit, machine, versions
 from kpc.tools.bench.records import Record, as_json
 
@@ -37,6 +38,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
+    if argv[:1] == ["compare"]:
+        compare.main(argv[1:])
+        return
     options = _parser().parse_args(argv)
     origin = {
         "commit": commit(),
@@ -70,8 +74,9 @@ def _parser() -> argparse.ArgumentParser:
     kinds = parser.add_subparsers(
         dest="kind",
         required=True,
-        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|web|codec|entropy|decode",
+        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|web|codec|entropy|decode|compare",
     )
+    kinds.add_parser("compare", add_help=False, help="what is better and worse in new records than in old ones")
     for module in (encoding_commands, playing_commands, coding_commands):
         module.add_parsers(kinds)
     for kind in kinds.choices.values():
