@@ -12,6 +12,7 @@ import pytest
 
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, UsageError
+from kpc.tools.cli import kpinfo
 
 
 def raising(error: BaseException, cause: BaseException | None = None) -> Callable[[list[str]], None]:
@@ -138,3 +139,10 @@ def test_output_is_checked_before_the_work(
     with pytest.raises(OSError, match="no permission to write there") as caught:
         cli.check_writable(tmp_path / name, is_folder=is_folder)
     assert caught.value.filename == str(tmp_path / name)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_is_refused_rather_than_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    os.mkfifo(tmp_path / "scene.kpc")
+    assert kpinfo.main([str(tmp_path / "scene.kpc")]) == 1
+    assert "scene.kpc: is a pipe" in capsys.readouterr().err

@@ -1,5 +1,6 @@
 """Where a file's bytes come from: a disk, memory, or HTTP range requests."""
 
+import errno
 import io
 import os
 import re
@@ -118,6 +119,8 @@ class _FileSource:
         if file is not None:
             self.size = file.seek(0, io.SEEK_END)
         else:
+            if Path(self.name).is_fifo():  # opening it would wait for a writer, without a word
+                raise OSError(errno.ESPIPE, "is a pipe, and scenes are read in any order; save it to a file", self.name)
             with open(self.name, "rb") as opened:  # so that an unreadable file is reported here, not later
                 self.size = opened.seek(0, io.SEEK_END)
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from kpc.format.common.progress import Progress
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.metadata import Opening, ViewLimits, camera_document, limits_document, rounded
 from kpc.format.scene.rig import Rig, surround_focus
@@ -27,6 +28,7 @@ Look = Callable[[Camera], tuple[np.ndarray, np.ndarray]]
 MOST_CAMERAS, SEEN_WIDTH, JUDGED_WIDTH = 16, 40, 20
 # A camera sees a point up to so much farther than what it sees in the direction of that point, as a share of distance.
 DEPTH_TOLERANCE = 0.1
+USUAL_VIEWS = 130  # that are rendered where cameras stand on one side of a scene
 # A pixel is opaque from this opacity on. Cameras see through the scene if more than this share of their pixels is not.
 OPAQUE, SEEN_THROUGH = 0.5, 0.02
 # The share of pixels that must hold, at most, and how far it may fall below that of the median camera.
@@ -106,9 +108,17 @@ def find_view(scene: Scene, look: Look) -> tuple[Opening | None, ViewLimits | No
     ahead = [(rig.focus - camera.camera_to_world[:3, 3]) @ -camera.camera_to_world[:3, 2] for camera in scene.cameras]
     if len(eyes) < 3 or np.mean(np.array(ahead) > 0) < 0.9:  # cameras that look outwards have no focus
         return None, None
-    judge = _Judge(scene.cameras, look)
-    opening = _opening_camera(scene.cameras[0], judge)
-    return Opening(opening, 0.0), _find_limits(replace(rig, cameras=(opening, *rig.cameras[1:])), judge)
+    with Progress("finding view limits", USUAL_VIEWS, "views") as bar:
+
+        def counted(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+            bar.extend(1)
+            seen = look(camera)
+            bar.advance()
+            return seen
+
+        judge = _Judge(scene.cameras, counted)
+        opening = _opening_camera(scene.cameras[0], judge)
+        return Opening(opening, 0.0), _find_limits(replace(rig, cameras=(opening, *rig.cameras[1:])), judge)
 
 
 def view_members(scene: Scene, opening: Opening | None, limits: ViewLimits | None) -> dict[str, Any]:

@@ -40,7 +40,7 @@ DEFAULT_HEIGHT, MIN_WIDTH, MAX_WIDTH = 720, 480, 1600
 # Resets of the graphics card after which kpplay gives up.
 MAX_RESETS = 3
 # Options that a page in a browser does not have.
-WINDOW_OPTIONS = ("size", "quality", "target_fps", "path", "frames", "screenshot")
+WINDOW_OPTIONS = ("size", "quality", "target_fps", "path", "folder", "frames", "screenshot")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -55,7 +55,9 @@ def _command(argv: list[str]) -> None:
         return
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames} is not positive")
-    cli.make_folder(Path(options.folder))
+    if options.screenshot is not None:
+        cli.check_writable(options.screenshot)
+    cli.make_folder(Path(options.folder or "."))
     path = None if options.path is None else CameraPath.load(options.path)
 
     # Imported here so that errors in the options are reported without OpenGL's libraries.
@@ -125,7 +127,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--folder",
         type=cli.file_name,
-        default=".",
         metavar="DIR",
         help="for screenshots, videos and camera paths; it is made (default: the working directory)",
     )
@@ -170,7 +171,7 @@ def _play(
             name, is_remote = stream.source.name, isinstance(stream.source, RemoteSource)
             playlist.opened(file, name if is_remote else os.path.abspath(name))
             player = Player(
-                window, stream, settings, resume_from=interrupted, folder=Path(options.folder), playlist=playlist
+                window, stream, settings, resume_from=interrupted, folder=Path(options.folder or "."), playlist=playlist
             )
             if before is not None:
                 player.state.play_like(before)

@@ -135,12 +135,13 @@ class Panels:
         imgui.text_disabled(f"{statistics.samples:.1f} samples per ray, {view.renderer.memory_bytes / 1e6:.0f} MB")
         imgui.text_disabled(view.device.split("(")[0].strip()[:DEVICE_CHARACTERS])
         imgui.text_disabled(f"drawn by {view.renderer.drawn_by}")
-        if view.renderer.is_loading:
-            imgui.text_disabled("compiling faster code")
-        if isinstance(self.state.scene.decoder, HybridDecoder):
-            imgui.text_disabled("hybrid decoder (slower)")
+        # One line of these, since the panel is as high as a window of 480 rows permits.
         if not stream.is_settled:
             imgui.text_disabled(f"{stream.loaded_fraction:.0%} loaded, {stream.bytes_per_s / 1e3:,.0f} KB/s")
+        elif view.renderer.is_loading:
+            imgui.text_disabled("compiling faster code")
+        elif isinstance(self.state.scene.decoder, HybridDecoder):
+            imgui.text_disabled("hybrid decoder (slower)")
 
     def _quality(self) -> None:
         """The quality level, and the frame rate to hold."""

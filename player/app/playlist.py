@@ -1,12 +1,16 @@
 """The files that a player goes through, and those that were opened lately. No window."""
 
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import valid_unicode
+from kpc.format.container.http_address import is_url, public_name
 
 # Files that are remembered as opened lately.
 MAX_RECENT = 8
+# Characters of a file's name in a menu, so that it fits the smallest window.
+NAME_CHARACTERS = 56
 
 
 class Playlist:
@@ -29,6 +33,8 @@ class Playlist:
     def named(arguments: Sequence[str], recent: Sequence[str] = ()) -> "Playlist":
         """Return the playlist of arguments of the command line; a folder stands for its .kpc files in order of names.
 
+        Folders that have such names do not count, nor do hidden files, such as macOS leaves beside others.
+
         Raises:
             UsageError: a folder has no .kpc files.
             OSError: a folder cannot be read.
@@ -38,7 +44,11 @@ class Playlist:
             if not Path(argument).is_dir():
                 files.append(argument)
                 continue
-            found = sorted(str(path) for path in Path(argument).iterdir() if path.suffix.lower() == ".kpc")
+            found = sorted(
+                str(path)
+                for path in Path(argument).iterdir()
+                if path.suffix.lower() == ".kpc" and not path.name.startswith(".") and not path.is_dir()
+            )
             if not found:
                 raise UsageError(f"{argument}: this folder has no .kpc files; name a file, or another folder")
             files += found
@@ -61,3 +71,23 @@ class Playlist:
                 self.files.insert(self.position + 1, file)
             self.position = self.files.index(file)
         self.recent = (public_name, *(name for name in self.recent if name != public_name))[:MAX_RECENT]
+
+
+def menu_names(files: Sequence[str]) -> list[str]:
+    """Return short names that tell files apart: their own, with that of the folder where another is called alike.
+
+    Long names lose their middle, since takes differ at the end.
+
+    Args:
+        files: paths and addresses.
+    """
+    paths = [PurePath(public_name(file) if is_url(file) else file) for file in files]
+    # By the paths, since a file may be there twice.
+    alike = {path.name for path in paths if any(one.name == path.name and one != path for one in paths)}
+    names = [f"{path.parent.name}/{path.name}" if path.name in alike else path.name for path in paths]
+    return [_shortened(valid_unicode(name)) for name in names]
+
+
+def _shortened(name: str) -> str:
+    head = NAME_CHARACTERS // 2
+    return name if len(name) <= NAME_CHARACTERS else f"{name[:head]}...{name[head + 3 - NAME_CHARACTERS :]}"

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 from urllib.parse import urlsplit
 
+from kpc.format.common.errors import UsageError
 from kpc.format.container.groups import Groups
 from kpc.format.container.http_address import is_url
 from kpc.player.sharing import site
@@ -39,6 +40,7 @@ def play_in_browser(files: Sequence[str]) -> None:
 
     Raises:
         OSError, FormatError, NetworkError: a file cannot be read.
+        UsageError: an address has a user and password.
     """
     with serving_pages(files) as url:
         is_open = webbrowser.open(url)
@@ -62,6 +64,8 @@ def serving_pages(files: Sequence[str]) -> "Iterator[str]":
 
 def _write_pages(files: Sequence[str], folder: Path) -> dict[str, Path]:
     """Write a page for each scene and, for several, a gallery; return where the files are that the pages name."""
+    if any(is_url(file) and "@" in urlsplit(file).netloc for file in files):
+        raise UsageError("--web: browsers take no user and password in the address of a file; play it without --web")
     site.copy_player(folder)
     elsewhere: dict[str, Path] = {}
     names = site.distinct_names([Path(urlsplit(file).path if is_url(file) else file).stem for file in files])

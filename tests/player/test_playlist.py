@@ -3,12 +3,13 @@ from pathlib import Path
 import pytest
 
 from kpc.format.common.errors import UsageError
-from kpc.player.app.playlist import MAX_RECENT, Playlist
+from kpc.player.app.playlist import MAX_RECENT, NAME_CHARACTERS, Playlist, menu_names
 
 
 def test_a_folder_stands_for_its_files(tmp_path: Path) -> None:
-    for name in ("b.kpc", "a.KPC", "notes.txt"):
+    for name in ("b.kpc", "a.KPC", "notes.txt", "._a.kpc"):
         (tmp_path / name).touch()
+    (tmp_path / "folder.kpc").mkdir()
     playlist = Playlist.named(["x.kpc", str(tmp_path), "https://host/y.kpc"])
     first, last = str(tmp_path / "a.KPC"), str(tmp_path / "b.kpc")
     assert playlist.files == ["x.kpc", first, last, "https://host/y.kpc"]
@@ -27,3 +28,12 @@ def test_what_is_opened_follows_the_present_file_and_is_remembered() -> None:
     for number in range(20):
         playlist.opened(f"{number}.kpc", f"{number}.kpc")
     assert len(playlist.recent) == MAX_RECENT and playlist.recent[0] == "19.kpc"
+
+
+def test_a_menu_tells_files_apart() -> None:
+    long = "a_take_" * 20
+    files = ["one/scene.kpc", "two/scene.kpc", "other.kpc", "other.kpc", f"{long}01.kpc", f"{long}02.kpc"]
+    names = menu_names([*files, "https://me:secret@host/x.kpc?token=secret"])
+    assert names[:4] == ["one/scene.kpc", "two/scene.kpc", "other.kpc", "other.kpc"]
+    assert names[4].endswith("01.kpc") and names[5].endswith("02.kpc") and names[6] == "x.kpc"
+    assert max(map(len, names)) == NAME_CHARACTERS

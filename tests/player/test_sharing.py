@@ -184,3 +184,10 @@ def test_options_of_the_window_are_refused_for_a_page(capsys: pytest.CaptureFixt
 def test_no_page_loads_from_elsewhere() -> None:
     for page in (site.scene_page(shared()), site.gallery_page({"a": shared()}, "g")):
         assert not re.findall(r"https?://", page)
+
+
+def test_a_password_in_an_address_is_refused_before_the_browser_does(capsys: pytest.CaptureFixture[str]) -> None:
+    assert kpplay.main(["--web", "https://me:secret@host.invalid/a.kpc"]) == 2
+    assert kpplay.main(["--web", str(SAMPLE), "--folder", "films"]) == 2
+    said = capsys.readouterr().err
+    assert "no user and password" in said and "secret" not in said and "--folder: is for the window" in said

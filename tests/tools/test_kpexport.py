@@ -10,6 +10,7 @@ import pytest
 from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.images import linear_from_srgb, srgb_from_linear
+from kpc.format.common.progress import Progress
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import SPACE_PLANES, Clip, Decoder, Scene
 from kpc.player.cpu.reference import SceneAtTime
@@ -135,6 +136,18 @@ def test_a_mesh_is_closed_and_faces_outwards(run: Run, ball_file: Path, tmp_path
     assert np.abs(lengths - 1).max() < 1e-5
     position = reader.document["accessors"][primitive["attributes"]["POSITION"]]
     assert np.allclose([position["min"], position["max"]], mesh.bounds)
+
+
+@pytest.mark.parametrize("is_mesh", [False, True])
+def test_the_bar_moves_within_a_file(
+    run: Run, ball_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_mesh: bool
+) -> None:
+    """A file may take minutes, and all of its parts together are one file."""
+    shares: list[float] = []
+    monkeypatch.setattr(Progress, "advance", lambda self, count=1: shares.append(count))
+    words = ["--mesh", "--resolution", "12"] if is_mesh else ["--size", "16x12"]
+    assert run(ball_file, "-o", tmp_path / "out.ply", *words)[0] == 0
+    assert len(shares) >= 4 and sum(shares) == pytest.approx(1)
 
 
 def test_meshes_in_ply_have_the_same_shape(run: Run, ball_file: Path, tmp_path: Path) -> None:

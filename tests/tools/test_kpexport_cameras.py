@@ -1,5 +1,6 @@
 """Cameras of kpexport to glTF and USD, and back."""
 
+import contextlib
 import json
 import math
 from dataclasses import replace
@@ -10,6 +11,7 @@ import pytest
 from test_kpexport import save
 
 import kpc
+from kpc.format.common.errors import MediaError
 from kpc.format.scene.cameras import View, load_views, save_views
 from kpc.format.scene.metadata import Metadata
 from kpc.player.app.camera_paths import CameraPath
@@ -176,3 +178,14 @@ def test_damaged_usd_is_refused_in_one_line(
     (tmp_path / "in.usda").write_text(text)
     assert kpexport.main([str(tmp_path / "in.usda"), "-o", str(tmp_path / "out.json")]) == 1
     assert reason in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_usd_that_cannot_be_written_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed, which reads and writes USD")
+    from kpc.tools.exchange import usd_cameras
+
+    aside = tmp_path / "aside.usda"
+    aside.mkdir()  # which no file replaces
+    monkeypatch.setattr(usd_cameras, "atomic_write", lambda path: contextlib.nullcontext(aside))
+    with pytest.raises(MediaError, match=r"out\.usda: cannot be written \(.+\)$"):
+        usd_cameras.write_usd_cameras(tmp_path / "out.usda", [], 24.0)

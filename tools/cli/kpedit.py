@@ -58,6 +58,11 @@ def _command(argv: list[str]) -> None:
         size, kept_s = save(with_metadata(options.scene, metadata), options.output), None
     else:
         size, kept_s = edit(options.scene, options.output, edits, metadata)
+    if (kept_s is not None or options.box is not None) and size > options.scene.stat().st_size:
+        print(
+            "kpedit: larger than the source, since texels are predicted from less; kpenc makes it smaller, at a loss",
+            file=sys.stderr,
+        )
     print(f"{options.output}: {size:,} bytes{_changed_time(options, kept_s)}")
 
 

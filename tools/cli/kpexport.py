@@ -14,24 +14,27 @@ metadata, if there are any.
 import argparse
 import sys
 import time as clock
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 import kpc
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
-from kpc.format.common.progress import progress
+from kpc.format.common.progress import Progress
 from kpc.format.container.groups import GroupedScene, Groups
-from kpc.format.scene.cameras import View, save_views
-from kpc.format.scene.metadata import Metadata
+from kpc.format.scene.cameras import Camera, View, save_views
+from kpc.format.scene.metadata import Metadata, camera_document
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
-from kpc.player.cpu.reference import Part
+from kpc.player.cpu.reference import Part, Rendering
 from kpc.player.viewpoints import fit_camera
 from kpc.tools.exchange import gltf_cameras
 from kpc.tools.exchange.camera_tracks import Track, load_tracks, placed, views_of
+from kpc.tools.exchange.field import Done
 from kpc.tools.exchange.geometry_files import write_geometry
 from kpc.tools.exchange.mesh import Mesh, surface_mesh
 from kpc.tools.exchange.options import DENSITY, PATH_FPS, RESOLUTION, SPACING_PARTS, USD_SUFFIXES, Task, parser, task_of
@@ -76,12 +79,16 @@ def _export_geometry(task: Task, options: argparse.Namespace) -> None:
     if task.is_folder:
         cli.make_folder(output)
     started, count = clock.monotonic(), 0
-    for number in progress(shots.numbers, "export", unit="files"):
-        time = shots.time(number)
-        shape = _mesh(loaded, time, options) if render is None else _points(loaded, render, time, options)
-        path = output / f"{shots.name(number)}{task.suffix}" if task.is_folder else output
-        write_geometry(path, shape, placement)
-        count += len(shape.points)
+    with Progress("export", len(shots), "files") as bar:  # advanced by parts of a file, which may take minutes
+        for number in shots.numbers:
+            time = shots.time(number)
+            if render is None:
+                shape: Mesh | Cloud = _mesh(loaded, time, options, bar.advance)
+            else:
+                shape = _points(loaded, render, time, options, bar.advance)
+            path = output / f"{shots.name(number)}{task.suffix}" if task.is_folder else output
+            write_geometry(path, shape, placement)
+            count += len(shape.points)
     what = "vertices" if options.mesh else "points"
     files = f"{len(shots)} file{'s' * (len(shots) != 1)}, " if task.is_folder else ""
     print(f"{output}: {files}{count:,} {what}, in {clock.monotonic() - started:.1f} s")
@@ -111,7 +118,9 @@ def _renderer(loaded: Scene | GroupedScene, options: argparse.Namespace) -> Rend
     return render
 
 
-def _points(loaded: Scene | GroupedScene, render: Render, time: float, options: argparse.Namespace) -> Cloud:
+def _points(
+    loaded: Scene | GroupedScene, render: Render, time: float, options: argparse.Namespace, done: Done
+) -> Cloud:
     scene, local_time = loaded.at(time)
     bounds = scene.bounds
     longest = float((bounds[1] - bounds[0]).max())
@@ -121,16 +130,22 @@ def _points(loaded: Scene | GroupedScene, render: Render, time: float, options: 
     cameras = Rig.of(scene).cameras
     if options.size is not None:
         cameras = tuple(fit_camera(camera, *options.size) for camera in cameras)
-    cloud = surface_points(((camera, render(camera, time)) for camera in cameras), bounds, spacing)
+
+    def picture(camera: Camera) -> tuple[Camera, Rendering]:
+        seen = render(camera, time)
+        done(1 / len(cameras))
+        return camera, seen
+
+    cloud = surface_points(map(picture, cameras), bounds, spacing)
     if not len(cloud.points):
         raise KpcError(f"{options.input}: its cameras see no surface at time {time:g}; choose another --time")
     normals = normals_of(scene, local_time, cloud.points) if options.normals else None
     return Cloud(cloud.points, cloud.colours, normals)
 
 
-def _mesh(loaded: Scene | GroupedScene, time: float, options: argparse.Namespace) -> Mesh:
+def _mesh(loaded: Scene | GroupedScene, time: float, options: argparse.Namespace, done: Done) -> Mesh:
     scene, local_time = loaded.at(time)
-    return surface_mesh(scene, local_time, options.resolution or RESOLUTION, options.density or DENSITY)
+    return surface_mesh(scene, local_time, options.resolution or RESOLUTION, options.density or DENSITY, done)
 
 
 def _export_cameras(task: Task, options: argparse.Namespace) -> None:
@@ -139,11 +154,18 @@ def _export_cameras(task: Task, options: argparse.Namespace) -> None:
     cameras, metadata = opened.cameras(), opened.metadata()
     if not cameras:
         raise KpcError(f"{options.input}: holds no cameras; give a camera file or a path of the player")
+    others = (opened.open(number).cameras() for number in range(1, len(opened)))
+    if any(_documents(other) != _documents(cameras) for other in others if other):
+        _say("the groups of the clip have different cameras; those of the first are written")
     placement = Placement.of(metadata)
     _say_where(placement, metadata)
     names = metadata.names_of(len(cameras))
     tracks = [Track(name, (View(camera, 0.0, name),)) for name, camera in zip(names, cameras, strict=True)]
     _write_cameras(task, Path(options.output), placed(tracks, placement), PATH_FPS)
+
+
+def _documents(cameras: Sequence[Camera]) -> list[dict[str, Any]]:
+    return [camera_document(camera) for camera in cameras]
 
 
 def _exchange_cameras(task: Task, options: argparse.Namespace) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from kpc.format.coding.quantise import QuantisedScene, needed_texels
+from kpc.format.common.progress import progress
 from kpc.format.container.container import Chunk, Codec, Entry, assemble, store
 from kpc.format.container.rewriting import copied
 from kpc.format.container.scene_io import SceneReader, read
@@ -33,7 +34,7 @@ def edited(reader: SceneReader, edit: Edit) -> bytes:
     numbers = {_place_in(entry): number for number, entry in enumerate(reader.index)}
     old = {_place_in(chunk): chunk.raw for chunk in scene_chunks(before)}
     stored = []
-    for chunk in scene_chunks(after):
+    for chunk in progress(scene_chunks(after), "editing", unit="chunks"):
         place = _place_in(chunk)
         number = numbers.get(place)
         is_same = number is not None and old.get(place) == chunk.raw

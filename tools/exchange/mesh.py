@@ -7,11 +7,13 @@ import numpy as np
 from kpc.format.common.errors import UsageError
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, Scene
-from kpc.player.cpu.reference import SceneAtTime, render_rays
-from kpc.tools.exchange.field import box_points, density_grid
+from kpc.player.cpu.reference import Rendering, SceneAtTime, render_rays
+from kpc.tools.exchange.field import Done, box_points, density_grid
 
 # Rays that give a vertex its colour begin this many cells before it.
 AHEAD_CELLS = 2.0
+# Rays that are rendered at once.
+RAYS = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Mesh:
     colours: np.ndarray
 
 
-def surface_mesh(scene: Scene, time: float, resolution: int, level: float) -> Mesh:
+def surface_mesh(scene: Scene, time: float, resolution: int, level: float, done: Done = lambda share: None) -> Mesh:
     """Return the isosurface of the density in the box of a scene at a time in [0, 1].
 
     A vertex is coloured as the one of the scene's cameras sees it that faces it most, by a ray that begins just before
@@ -42,6 +44,7 @@ def surface_mesh(scene: Scene, time: float, resolution: int, level: float) -> Me
         time: in [0, 1] over it.
         resolution: points of the grid along the longest edge of the box.
         level: density of the surface, per longest edge of the box.
+        done: as for `density_grid`.
 
     Raises:
         UsageError: the density does not cross the level.
@@ -51,7 +54,7 @@ def surface_mesh(scene: Scene, time: float, resolution: int, level: float) -> Me
     edges = (scene.aabb[1] - scene.aabb[0]).astype(np.float64)
     counts = np.maximum(np.round(edges / edges.max() * (resolution - 1)).astype(int) + 1, 2)
     nx, ny, nz = counts.tolist()
-    grid = density_grid(scene, SceneAtTime.of(scene, time), (nx, ny, nz))
+    grid = density_grid(scene, SceneAtTime.of(scene, time), (nx, ny, nz), lambda share: done(share / 2))
     if not level < grid.max():
         raise UsageError(
             f"--density {level:g}: no surface; the density goes up to {grid.max():.3g} per longest edge of the box"
@@ -64,7 +67,8 @@ def surface_mesh(scene: Scene, time: float, resolution: int, level: float) -> Me
     triangles = _outward(points, triangles.astype(np.int64))
     normals = _vertex_normals(points, triangles)
     spacing = float((scene.bounds[1] - scene.bounds[0]).max()) / (resolution - 1)
-    return Mesh(points, triangles, normals, _colours(scene, time, points, normals, AHEAD_CELLS * spacing))
+    colours = _colours(scene, time, points, normals, AHEAD_CELLS * spacing, lambda share: done(share / 2))
+    return Mesh(points, triangles, normals, colours)
 
 
 def _outward(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -87,7 +91,9 @@ def _vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1), [0.0, 1.0, 0.0])
 
 
-def _colours(scene: Scene, time: float, points: np.ndarray, normals: np.ndarray, ahead: float) -> np.ndarray:
+def _colours(
+    scene: Scene, time: float, points: np.ndarray, normals: np.ndarray, ahead: float, done: Done
+) -> np.ndarray:
     eyes = np.stack([camera.camera_to_world[:3, 3] for camera in Rig.of(scene).cameras])
     directions, facing = -normals, np.full(len(points), -2.0)
     for eye in eyes:
@@ -97,7 +103,16 @@ def _colours(scene: Scene, time: float, points: np.ndarray, normals: np.ndarray,
         directions = np.where((cosine > facing)[:, None], towards, directions)
         facing = np.maximum(facing, cosine)
     origins = (points - ahead * directions).astype(np.float32)
-    seen = render_rays(scene, origins, directions.astype(np.float32), time)
+    colours = []
+    for start in range(0, len(points), RAYS):
+        some = slice(start, start + RAYS)
+        colours.append(_straight(scene, render_rays(scene, origins[some], directions[some].astype(np.float32), time)))
+        done(len(colours[-1]) / len(points))
+    return np.concatenate(colours)
+
+
+def _straight(scene: Scene, seen: Rendering) -> np.ndarray:
+    """Return the colours of rays without the background behind them."""
     covering = seen.rgb - (1 - seen.opacity)[:, None] * scene.background
     opacity = seen.opacity[:, None]
     straight = np.divide(covering, opacity, out=np.zeros_like(covering), where=opacity > 1e-6)

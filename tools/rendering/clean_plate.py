@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from kpc.format.common.progress import progress
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Rendering
@@ -57,7 +58,9 @@ class CleanPlates:
             if known_scene is scene and _are_equal(known, camera):
                 return plate
         times = INSTANTS if scene.is_dynamic else INSTANTS[:1]
-        plate = clean_plate([self._draw(scene, camera, float(time)) for time in times])
+        # A camera that moves needs a plate for each frame; of those, the bar of the frames tells the time left.
+        shown = progress(times.tolist(), "clean plate", unit="pictures", shown=not self._plates)
+        plate = clean_plate([self._draw(scene, camera, time) for time in shown])
         self._plates = [*self._plates[-1:], (scene, camera, plate)]
         return plate
 
