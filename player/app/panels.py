@@ -70,6 +70,7 @@ class Panels:
         margin, spacing = em(MARGIN_EM), em(SPACING_EM)
         bottom = height - margin
         across = free = 0.0, width
+        below = margin
         if visible.controls:
             bottom = self._transport(bottom)
             if visible.planes and state.scene.is_dynamic:
@@ -77,9 +78,9 @@ class Panels:
             bottom = self._filming(bottom)
             right = self._status(bottom - margin - spacing)
             free = (right, width) if width - right > em(MIN_MESSAGE_EM) else across
-            top = self._graphs(margin) if visible.graphs else margin
+            below = self._graphs(margin) if visible.graphs else margin
             if visible.path:
-                self._path.build(top, bottom - spacing)
+                below = self._path.build(below, bottom - spacing)
         else:
             bottom = self._filming(bottom)
         if visible.keys:
@@ -88,8 +89,9 @@ class Panels:
             ask(self.actions)
         if clock.monotonic() < state.notice.until:
             message("notice", state.notice.text, across, bottom - margin, 1.0, ERROR if state.notice.is_error else None)
-        if (text := state.stream.message) is not None:
-            message("stream", text, free, margin, 0.0)
+        # It lies above everything, so it waits until a menu is closed.
+        if (text := state.stream.message) is not None and not imgui.is_popup_open("", imgui.PopupFlags.ANY_POPUP):
+            message("stream", text, free, below, 0.0)
 
     def _status(self, bottom: float) -> float:
         """Statistics and settings on the left, above `bottom`; return the right edge."""
@@ -137,7 +139,9 @@ class Panels:
         imgui.text_disabled(f"drawn by {view.renderer.drawn_by}")
         # One line of these, since the panel is as high as a window of 480 rows permits.
         if not stream.is_settled:
-            imgui.text_disabled(f"{stream.loaded_fraction:.0%} loaded, {stream.bytes_per_s / 1e3:,.0f} KB/s")
+            share = stream.loaded_fraction
+            rate = f"{share:.0%} loaded, {stream.bytes_per_s / 1e3:,.0f} KB/s"
+            imgui.text_disabled("loading the next group" if share >= 1 else rate)
         elif view.renderer.is_loading:
             imgui.text_disabled("compiling faster code")
         elif isinstance(self.state.scene.decoder, HybridDecoder):

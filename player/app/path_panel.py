@@ -7,7 +7,7 @@ from kpc.player.app.actions import Actions
 from kpc.player.app.desktop import imgui
 from kpc.player.app.path_follower import MAX_GAP_S, MIN_GAP_S
 from kpc.player.app.state import PlayerState
-from kpc.player.app.widgets import MARGIN_EM, PANEL_EM, em, panel, place_next, tip, window_size
+from kpc.player.app.widgets import MARGIN_EM, PANEL_EM, SPACING_EM, em, panel, place_next, tip, window_size
 
 # What the panel says before there are keyframes.
 NO_KEYFRAMES = "No keyframes yet. Move the camera and\npress K, at least twice, or drop a\nsaved path on the window."
@@ -23,37 +23,42 @@ class PathPanel:
     def __init__(self, state: PlayerState, actions: Actions) -> None:
         self.state, self.actions = state, actions
 
-    def build(self, top: float, bottom: float) -> None:
-        """Build the panel on the right between two heights, screen units."""
-        follower, actions = self.state.follower, self.actions
+    def build(self, top: float, bottom: float) -> float:
+        """Build the panel on the right between two heights, screen units; return where something below it begins."""
         place_next(window_size()[0] - em(MARGIN_EM), top, 1.0, 0.0, max_height=bottom - top, min_width=em(PANEL_EM))
         with panel("path", scrolls=True):
-            if imgui.button("add"):
-                actions.add_keyframe()
-            tip("Add a keyframe: the present camera and time (K)")
-            imgui.same_line()
-            imgui.begin_disabled(follower.is_empty)
-            if imgui.button("stop" if follower.is_active and not actions.filming.is_along_path else "follow"):
-                actions.follow_or_stop()
-            imgui.same_line()
-            if imgui.button("record"):
-                actions.start_or_stop_filming(along_path=True)
-            imgui.same_line()
-            if imgui.button("save"):
-                actions.save_path()
-            imgui.end_disabled()
-            if follower.is_empty:
-                imgui.text_disabled(NO_KEYFRAMES)
-                return
-            self._slider()
-            row = imgui.get_frame_height_with_spacing()
-            count = len(follower.path.keyframes)
-            if imgui.begin_child("##keyframes", (0, row * min(count, VISIBLE_KEYFRAMES))):
-                for number in range(count):
-                    imgui.push_id(number)
-                    self._keyframe(number)
-                    imgui.pop_id()
-            imgui.end_child()
+            self._content()
+            return top + imgui.get_window_height() + em(SPACING_EM)
+
+    def _content(self) -> None:
+        """What can be done with the path, the position on it, and its keyframes."""
+        follower, actions = self.state.follower, self.actions
+        if imgui.button("add"):
+            actions.add_keyframe()
+        tip("Add a keyframe: the present camera and time (K)")
+        imgui.same_line()
+        imgui.begin_disabled(follower.is_empty)
+        if imgui.button("stop" if follower.is_active and not actions.filming.is_along_path else "follow"):
+            actions.follow_or_stop()
+        imgui.same_line()
+        if imgui.button("record"):
+            actions.start_or_stop_filming(along_path=True)
+        imgui.same_line()
+        if imgui.button("save"):
+            actions.save_path()
+        imgui.end_disabled()
+        if follower.is_empty:
+            imgui.text_disabled(NO_KEYFRAMES)
+            return
+        self._slider()
+        row = imgui.get_frame_height_with_spacing()
+        count = len(follower.path.keyframes)
+        if imgui.begin_child("##keyframes", (0, row * min(count, VISIBLE_KEYFRAMES))):
+            for number in range(count):
+                imgui.push_id(number)
+                self._keyframe(number)
+                imgui.pop_id()
+        imgui.end_child()
 
     def _slider(self) -> None:
         """The position on the path."""

@@ -20,7 +20,7 @@ from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
 from kpc.player.gl.renderer import Renderer
 from kpc.player.streaming.prefetch import Playhead
-from kpc.player.streaming.stream import Stream
+from kpc.player.streaming.stream import Stream, loading_message
 
 # The next group is opened so many seconds before it is shown, even if the one that is shown is still arriving.
 OPEN_AHEAD_S = 5.0
@@ -173,7 +173,7 @@ class GroupPlayback:
         if self._failure is not None:
             return f"loading stopped: {self._failure}"
         if self._is_incomplete:
-            return self.stream.message or f"loading, {self.bytes_per_s / 1e3:,.0f} KB/s"
+            return self.stream.message or loading_message(self.bytes_per_s)
         return self.stream.message
 
     @property

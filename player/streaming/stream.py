@@ -268,7 +268,7 @@ class Stream:
         if self._stalled and MONITOR.is_compiling:
             return NOTICE
         if self._stalled:
-            return f"loading, {self.bytes_per_s / 1e3:,.0f} KB/s"
+            return loading_message(self.bytes_per_s)
         return None
 
     def close(self) -> None:
@@ -369,3 +369,8 @@ class Stream:
     def _set_trouble(self, message: str | None) -> None:
         self._trouble = message
         self.arrived()
+
+
+def loading_message(bytes_per_s: float) -> str:
+    """Return what a user is told who has to wait; no rate where all has arrived and is being decoded."""
+    return f"loading, {bytes_per_s / 1e3:,.0f} KB/s" if bytes_per_s >= 500 else "loading"

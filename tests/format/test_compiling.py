@@ -82,12 +82,13 @@ def test_a_player_waiting_for_compilation_shows_the_notice(monkeypatch: pytest.M
 
     stream = Stream.__new__(Stream)
     stream._failure = stream._trouble = None
-    monkeypatch.setattr(Stream, "bytes_per_s", 2000.0)
-    for stalled, compiles, wanted in (
-        (True, True, NOTICE),
-        (True, False, "loading, 2 KB/s"),
-        (False, True, None),
+    for stalled, compiles, rate, wanted in (
+        (True, True, 2000.0, NOTICE),
+        (True, False, 2000.0, "loading, 2 KB/s"),
+        (True, False, 0.0, "loading"),  # all has arrived, and is being decoded
+        (False, True, 2000.0, None),
     ):
         stream._stalled = stalled
+        monkeypatch.setattr(Stream, "bytes_per_s", rate)
         monkeypatch.setattr(CompilationMonitor, "is_compiling", compiles)
         assert stream.message == wanted
