@@ -158,9 +158,14 @@ def read_video(
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
         shown = _shown(path, container, stream, info)
+        # PyAV links side data and frame in a circle: a frame whose side data were read keeps its pixels until garbage
+        # is collected, hundreds of frames later. They are therefore read only where the rotation changes.
+        rotation, matrix = None, np.eye(2)
         for number, frame in enumerate(_converted(path, shown, info, stream)):
             if number >= first:
-                yield _upright(frame.to_ndarray(), _display_matrix(path, frame))
+                if frame.rotation != rotation:
+                    rotation, matrix = frame.rotation, _display_matrix(path, frame)
+                yield _upright(frame.to_ndarray(), matrix)
             if number + 1 >= stop:
                 return
 
