@@ -68,7 +68,7 @@ def encode_groups(options: Options) -> dict[str, Any]:
     figures = _combine(found, [spans[number] for number in numbers], 0, options)
     size = _join(parts, clip_metadata([part.metadata for part in parts], figures), options)
     if not options.keep:
-        clear_work_folder(work)
+        clear_work_folder(work, options.cache)
     return _combine(found, [spans[number] for number in numbers], size, options) | {
         "encode_s": time.monotonic() - started
     }
@@ -154,7 +154,7 @@ def _read_finished(path: Path, options: Options) -> dict[str, Any]:
 
 def _fingerprint(options: Options) -> dict[str, str]:
     """Return all options that the result depends on, by their names on the command line, as text."""
-    without = ("resume", "keep", "preview", "trade")
+    without = ("resume", "keep", "preview", "trade", "cache")
     plain = {name: str(value) for name, value in vars(options).items() if name not in without}
     names = {f"--{name.removesuffix('_s').replace('_', '-')}": value for name, value in plain.items()}
     return names | {"the target": "{} {:g}".format(*options.trade.bound)}

@@ -81,7 +81,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     data = with_metadata(coded.data, with_figures(metadata, figures))
     size = save_scene(data, options.output, work)
     if not options.keep:
-        clear_work_folder(work)
+        clear_work_folder(work, options.cache)
     return {
         "file": str(options.output),
         "layout": dataset.layout,
@@ -155,7 +155,7 @@ def _evaluate_unwritable(trainer: Trainer, options: Options, started: float) -> 
     most = _most_tested(options, SceneRenderer(scene, trainer.field), trainer)
     test = evaluate(scene, trainer.dataset, most=most, field=trainer.field, label="testing the model", parts=True)
     if not options.keep:
-        clear_work_folder(options.work_dir)
+        clear_work_folder(options.work_dir, options.cache)
     return {
         "file": str(options.output),
         "device": str(trainer.device),

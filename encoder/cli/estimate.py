@@ -36,6 +36,7 @@ class Estimate:
         memory_bytes: peak memory.
         test_pictures: held-out pictures that are tested.
         held_out_pictures: all held-out pictures.
+        disk_bytes: decoded pixels.
     """
 
     train_s: float
@@ -44,6 +45,7 @@ class Estimate:
     memory_bytes: int
     test_pictures: int
     held_out_pictures: int
+    disk_bytes: int = 0
 
 
 def estimate(
@@ -87,7 +89,8 @@ def estimate(
     picture_s = picture_seconds(SceneRenderer(scene), trainer.dataset)
     held_out = int(trainer.dataset.pictures.is_test.sum())
     tested = min(held_out, affordable_pictures(train_s, picture_s) if test_views is None else test_views)
-    return Estimate(train_s, tested * picture_s, spent_s + all_coding_s, memory, tested, held_out)
+    disk_bytes = trainer.dataset.pixels.disk_bytes
+    return Estimate(train_s, tested * picture_s, spent_s + all_coding_s, memory, tested, held_out, disk_bytes)
 
 
 def _estimate_training(trainer: Trainer, time_budget_s: float | None) -> tuple[float, float]:

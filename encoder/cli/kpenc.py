@@ -59,8 +59,8 @@ def encode(options: Options) -> dict[str, Any]:
 def dry_run(options: Options) -> Estimate:
     """Do what `encode` does up to the first few hundred steps, and estimate the rest.
 
-    Nothing is left in the work folder that was not there before; with `options.keep`, decoded pixels are. Raises as
-    `encode`.
+    Nothing is left in the work folder that was not there before; with `options.keep` or `options.cache`, decoded pixels
+    are. Raises as `encode`.
     """
     with contextlib.nullcontext() if options.keep else leaving_nothing(options.work_dir):
         return _dry_run(options)
@@ -102,7 +102,7 @@ def profile_steps(options: Options) -> dict[str, Any]:
 
 def ablations(options: Options) -> list[str]:
     """Return the names of the ablations that change a run (`kpc.encoder.evaluation.ablations`). Raises as `encode`."""
-    make_work_folder(options.work_dir)
+    make_work_folder(options.work_dir, options.cache)
     dataset = read_dataset(options)
     return effective_ablations(options.config(dataset))
 

@@ -20,8 +20,8 @@ from kpc.format.scene.view_limits import find_view, view_members
 
 # Options that say where and when a run worked, not what it made, and those that the provenance names apart.
 NOT_RECORDED = {
-    "source", "output", "work", "keep", "resume", "device", "keep_checkpoint", "ablation", "test_views", "preview",
-    "time_budget_s", "trade", "members", "view_limits", "preset", "seed", "only", "wishes",
+    "source", "output", "work", "cache", "keep", "resume", "device", "keep_checkpoint", "ablation", "test_views",
+    "preview", "time_budget_s", "trade", "members", "view_limits", "preset", "seed", "only", "wishes",
 }  # fmt: skip
 # Bytes that the figures of `with_figures` may add to a file.
 FIGURES_BYTES = 200
@@ -40,6 +40,7 @@ def describe(options: Options, dataset: Dataset, scene: Scene, cameras: list[int
     names = [dataset.camera_names[dataset.pictures.camera[picture]] for picture in cameras]
     name, value = options.trade.bound
     fields = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    fields["downscale"] = dataset.downscale
     chosen = {
         option: _plain(fields[option])
         for option in fields

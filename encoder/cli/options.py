@@ -21,6 +21,10 @@ from kpc.format.container.metadata_options import TEXTS, add_metadata_options, m
 # `Options.test_views` for all held-out pictures.
 ALL_VIEWS = sys.maxsize
 
+# `--downscale auto`: pixels along the longer side of a picture for each texel of the finest planes, which cover about
+# what the picture shows. The 512 texels of K-Planes are trained on pictures of 1352 pixels.
+PIXELS_PER_TEXEL = 5
+
 # Options that apply where nothing is trained.
 TRANSCODE_OPTIONS = {
     "source",
@@ -44,6 +48,8 @@ class Options:
     Attributes:
         test_views: the most held-out pictures that are tested; None for as many as a share of the training time permits
             (`kpc.encoder.evaluation.testing_time`), ALL_VIEWS for all.
+        downscale: side of the blocks of pixels that are averaged; None for `most_across` pixels at most.
+        cache: the folder of decoded pixels, which is kept; None for the work folder.
         members: of the file's metadata: title, description, author, licence and date.
         view_limits: "auto", "none", or members of the view limits (`kpc.format.container.metadata_options`); None for
             "auto", or where nothing is trained for those of the source.
@@ -63,12 +69,13 @@ class Options:
     time_budget_s: float | None = None
     seed: int = 0
     device: str = "auto"
-    downscale: int = 1
+    downscale: int | None = 1
     holdout: str | None = None
     space: str = "auto"
     box: tuple[float, ...] | None = None
     appearance: str = "auto"
     work: Path | None = None
+    cache: Path | None = None
     keep: bool = False
     resume: bool = False
     test_views: int | None = None
@@ -88,6 +95,15 @@ class Options:
     @property
     def work_dir(self) -> Path:
         return self.work or self.output.with_name(self.output.name + ".work")
+
+    @property
+    def cache_dir(self) -> Path:
+        return self.cache or self.work_dir
+
+    @property
+    def most_across(self) -> int | None:
+        """The most pixels along the longer side of a picture that the preset's planes can hold; None if not limited."""
+        return None if self.downscale else PIXELS_PER_TEXEL * max(PRESETS[self.preset].resolutions)
 
     def config(self, dataset: Dataset) -> TrainConfig:
         """Return the configuration of training on a dataset."""
@@ -192,9 +208,11 @@ def _add_training_options(parser: argparse.ArgumentParser) -> None:
 def _add_dataset_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--downscale",
-        type=_positive,
+        type=_downscale,
         default=Options.downscale,
-        help="average blocks of N x N pixels first (default: %(default)s)",
+        metavar="N|auto",
+        help="average blocks of N x N pixels first; auto: so that pictures have no more than "
+        f"{PIXELS_PER_TEXEL} pixels for a texel of the preset's finest planes (default: %(default)s)",
     )
     parser.add_argument("--holdout", metavar="NAME", help="camera or file to test on, or 'none'")
     parser.add_argument(
@@ -241,6 +259,13 @@ def _add_sound_options(parser: argparse.ArgumentParser) -> None:
 def _add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--work", type=cli.named_path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)"
+    )
+    parser.add_argument(
+        "--cache",
+        type=cli.named_path,
+        metavar="DIR",
+        help="folder for decoded pixels, which is kept, and which encodes of one dataset can share, also at the same "
+        "time (default: the folder of --work)",
     )
     parser.add_argument("--keep", action="store_true", help="keep that folder when done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
@@ -357,6 +382,7 @@ def _options_from(given: argparse.Namespace) -> Options:
         box=given.box,
         appearance=given.appearance,
         work=given.work,
+        cache=given.cache,
         keep=given.keep,
         resume=given.resume,
         test_views=given.test_views,
@@ -379,6 +405,10 @@ def _positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value
+
+
+def _downscale(text: str) -> int | None:
+    return None if text == "auto" else _positive(text)
 
 
 def test_views(text: str) -> int:

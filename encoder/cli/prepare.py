@@ -69,7 +69,7 @@ def prepare_setting(options: Options) -> Setting:
     """
     check_outputs(options)
     choose_device(options.device)
-    make_work_folder(options.work_dir)
+    make_work_folder(options.work_dir, options.cache)
     try:
         dataset = read_dataset(options)
         aabb, mapping, why = _find_space(dataset, options)
@@ -79,6 +79,7 @@ def prepare_setting(options: Options) -> Setting:
         remove_if_empty(options.work_dir)
         raise
     log(dataset.describe())
+    log(f"pixels: {dataset.pixels.describe()}")
     for doubt in doubts(dataset):
         log(f"warning: {doubt}")
     log(f"space: {SPACES[type(mapping)][1]} ({why})")

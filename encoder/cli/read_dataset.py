@@ -37,7 +37,12 @@ def read_dataset(options: Options) -> Dataset:
         is_own = (file.parent / "images").is_dir()  # the frames of a moving camera lie beside the document
         root, transforms = (file.parent, None) if is_own else (root, file)
     return load_dataset(
-        root, options.work_dir, holdout=options.holdout, downscale=options.downscale, transforms=transforms
+        root,
+        options.cache_dir,
+        holdout=options.holdout,
+        downscale=options.downscale or 1,
+        most_across=options.most_across,
+        transforms=transforms,
     )
 
 

@@ -149,5 +149,5 @@ def print_estimate(expected: Estimate, options: Options, as_json: bool) -> None:
     print(
         f"would take {total:.0f} s, of which training {expected.train_s:.0f} s and testing {expected.test_pictures} of "
         f"{expected.held_out_pictures} held-out pictures {expected.test_s:.0f} s; {expected.memory_bytes / 1e6:.0f} MB "
-        "of memory"
+        f"of memory, {expected.disk_bytes / 1e6:.3g} MB of disk for decoded pixels"
     )

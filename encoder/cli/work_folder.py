@@ -14,22 +14,33 @@ CHECKPOINT = "checkpoint.kpck"
 POSES = "poses"  # the folder of cameras found for footage without poses
 
 
-def make_work_folder(work: Path) -> None:
-    """Create the work folder.
+def make_work_folder(work: Path, cache: Path | None = None) -> None:
+    """Create the work folder, and that of decoded pixels if it is another.
 
     Raises:
-        TrainingError: it cannot be created.
+        TrainingError: one cannot be created.
     """
-    try:
-        work.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TrainingError(f"{work}: {error.strerror}; name another folder for decoded pixels with --work") from error
+    for folder, option in ((work, "--work"), (cache, "--cache")):
+        try:
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise TrainingError(
+                f"{folder}: {error.strerror}; name another folder for decoded pixels with {option}"
+            ) from error
 
 
-def clear_work_folder(work: Path) -> None:
-    """Remove what kpenc has put into the work folder, and the folder if nothing else is in it."""
-    of_groups = ("group-*.kpc", "group-*.json", "group-*.kpck")
-    for pattern in ("pixels-*.bin", "pixels-*.json", *of_groups, CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"):
+def clear_work_folder(work: Path, cache: Path | None = None) -> None:
+    """Remove what kpenc has put into the work folder, and the folder if nothing else is in it.
+
+    Decoded pixels stay if `cache` names a folder for them, even this one, since other encodes may use them.
+    """
+    patterns = ["group-*.kpc", "group-*.json", "group-*.kpck", CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"]
+    if cache is None:
+        patterns += ["pixels-*.bin", "pixels-*.json"]
+        for packed in work.glob("pixels-*/"):
+            shutil.rmtree(packed)
+    for pattern in patterns:
         for leftover in work.glob(pattern):
             leftover.unlink(missing_ok=True)
     shutil.rmtree(work / POSES, ignore_errors=True)

@@ -79,6 +79,7 @@ class Dataset:
         masks: which pixels may be used; None if all may.
         left_out: how many images or videos in the folders that were read are not used.
         video_start_s: when the whole clip begins, in the seconds of the videos; None if the pictures are images.
+        downscale: side of the blocks of pixels of the files that were averaged.
         clocks: of videos by their names: the offset and rate that make their times those of the clip.
     """
 
@@ -93,6 +94,7 @@ class Dataset:
     masks: Masks | None = None
     left_out: int = 0
     video_start_s: float | None = None
+    downscale: int = 1
     clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property

@@ -4,14 +4,16 @@ import hashlib
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from kpc.encoder.datasets.cache_lock import exclusive
 from kpc.encoder.datasets.capture import Capture, CapturedView, MaskFile, first_names, report_orientations
 from kpc.encoder.datasets.dataset import Dataset, Pictures
+from kpc.encoder.datasets.decoded_pictures import cached_pixels
 from kpc.encoder.datasets.layouts import (
     anipose,
     blender,
@@ -27,12 +29,9 @@ from kpc.encoder.datasets.layouts import (
 )
 from kpc.encoder.datasets.left_out import count_left_out
 from kpc.encoder.datasets.masks import find_masks, load_masks
-from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
 from kpc.encoder.datasets.timeline import align
-from kpc.encoder.datasets.video import VideoInfo, read_video
+from kpc.encoder.datasets.video import VideoInfo
 from kpc.format.common.errors import DatasetError, MediaError
-from kpc.format.common.images import read_image, read_mask
-from kpc.format.common.progress import Progress
 from kpc.format.common.text import one_line, valid_unicode
 from kpc.format.scene.camera_checks import NUMBER_LIMIT
 from kpc.format.scene.scene import Clip
@@ -59,6 +58,7 @@ def load_dataset(
     *,
     holdout: str | None = None,
     downscale: int = 1,
+    most_across: int | None = None,
     progress: bool = True,
     transforms: Path | None = None,
 ) -> Dataset:
@@ -68,10 +68,12 @@ def load_dataset(
 
     Args:
         path: the dataset's folder.
-        cache_dir: made if it does not exist; holds one pixels-*.bin per dataset and downscale.
+        cache_dir: made if it does not exist; holds pixels-*, a file or a folder for each dataset and downscale. Other
+            processes may use it at the same time.
         holdout: the file to hold out for testing, "none", or None for the layout's default.
         downscale: every block of downscale^2 pixels is averaged to one; the remainder on the right and below is
             cropped. A block is usable if all its pixels are.
+        most_across: instead of `downscale`, the most pixels along the longer side of a picture.
         progress: whether to report progress on stderr.
         transforms: a document of `kpposes` for the folder, if it lies elsewhere.
 
@@ -83,6 +85,8 @@ def load_dataset(
     root = Path(path)
     try:
         capture = _recognise(root, holdout) if transforms is None else nerfstudio.read(root, holdout, transforms)
+        if most_across is not None:
+            downscale = _fitting_downscale(root, capture.views, most_across)
         _check(root, capture, downscale)
         report_orientations(root, capture.views)
         masks = find_masks(root, capture.views)
@@ -147,15 +151,29 @@ def _check(root: Path, capture: Capture, downscale: int) -> None:
             )
 
 
+def _fitting_downscale(root: Path, views: Sequence[CapturedView], most_across: int) -> int:
+    """Return the least factor that makes no picture longer than `most_across` pixels; print it."""
+    longest = max(max(view.width, view.height) for view in views)
+    factor = -(-longest // most_across)
+    print(
+        f"{root}: {longest} pixels across: --downscale {factor} (auto: {most_across} at most for the preset)",
+        file=sys.stderr,
+    )
+    return factor
+
+
 def _load(
     root: Path, capture: Capture, mask_files: list[MaskFile | None], cache_dir: Path, downscale: int, progress: bool
 ) -> Dataset:
     views = capture.views
     frames, times, clip, video_start_s = _times(root, capture)
     view_of = np.repeat(np.arange(len(views)), [len(some) for some in frames])  # the view of each picture
-    key = hashlib.sha256(os.fsencode(f"{root.resolve()} {downscale}")).hexdigest()[:12]
-    cache = _cached_pixels(root, views, frames, cache_dir / f"pixels-{key}.bin", downscale, progress)
-    masks = load_masks(root, views, mask_files, cache_dir / f"pixels-{key}-masks.bin", downscale, progress)
+    used = [(some.start, some.stop) for some in frames]
+    key = hashlib.sha256(os.fsencode(f"{root.resolve()} {downscale} {used}")).hexdigest()[:12]
+    path = cache_dir / f"pixels-{key}"
+    with exclusive(path.with_suffix(".lock")):
+        cache = cached_pixels(root, views, frames, path, downscale, progress)
+        masks = load_masks(root, views, mask_files, cache_dir / f"pixels-{key}-masks.bin", downscale, progress)
     intrinsics = np.array([v.intrinsics for v in views])[view_of] / downscale
     distortion = np.array([v.distortion for v in views])[view_of]
     is_fisheye = np.array([v.is_fisheye for v in views])[view_of]
@@ -196,6 +214,7 @@ def _load(
         names,
         masks,
         video_start_s=video_start_s,
+        downscale=downscale,
         clocks={view.file.relative_to(root).as_posix(): view.clock for view in views if view.video},
     )
 
@@ -269,89 +288,3 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     return rank[inverse.ravel()].astype(np.int32), first[order]
-
-
-def _cached_pixels(
-    root: Path, views: tuple[CapturedView, ...], frames: tuple[range, ...], file: Path, downscale: int, progress: bool
-) -> PixelCache:
-    """Open the cache of decoded pictures if it is up to date, else build it from the given frames of each view."""
-    sources = [
-        (view.file.relative_to(root).as_posix(), view.file.stat().st_size, view.file.stat().st_mtime_ns, view.upright)
-        for view in views
-    ]
-    sources += [
-        (view.foreground.relative_to(root).as_posix(), stat.st_size, stat.st_mtime_ns, False)
-        for view in views
-        if view.foreground is not None and (stat := view.foreground.stat())
-    ]
-    fingerprint = fingerprint_of(sources, [(some.start, some.stop) for some in frames], downscale)
-    cache = open_cache(file, fingerprint)
-    if cache is not None:
-        return cache
-    channels = 4 if any(view.has_alpha for view in views) else 3
-    pixels = sum(
-        (view.width // downscale) * (view.height // downscale) * len(some)
-        for view, some in zip(views, frames, strict=True)
-    )
-    with Progress(f"decoding {root.name}", sum(map(len, frames)), "picture", shown=progress) as bar:
-
-        def pictures() -> Iterator[np.ndarray]:
-            for view, some in zip(views, frames, strict=True):
-                for picture in _decoded(view, some):
-                    yield downscale_picture(picture, downscale)
-                    bar.advance()
-
-        return build_cache(file, fingerprint, pictures(), channels, pixels * channels)
-
-
-def _decoded(view: CapturedView, frames: range) -> Iterator[np.ndarray]:
-    """Yield the image of a view, or the given frames of its video."""
-    if view.video is None:
-        picture = read_image(view.file, upright=view.upright)
-        yield picture if view.foreground is None else _on_nothing(picture, view.foreground)
-    else:
-        yield from read_video(view.file, view.video, frames.start, frames.stop)
-
-
-def _on_nothing(picture: np.ndarray, foreground: Path) -> np.ndarray:
-    """Return a picture, (H, W, 3 or 4) uint8, with alpha 0 where a mask shows no foreground, (H, W, 4)."""
-    shown = read_mask(foreground)
-    if shown.shape != picture.shape[:2]:
-        raise DatasetError(
-            f"{foreground}: is {shown.shape[1]}x{shown.shape[0]}, but its picture is {picture.shape[1]}x"
-            f"{picture.shape[0]}; make the mask anew at that size"
-        )
-    alpha = np.where(shown, picture[..., 3] if picture.shape[2] == 4 else 255, 0).astype(np.uint8)
-    return np.concatenate([picture[..., :3], alpha[..., None]], axis=2)
-
-
-def downscale_picture(picture: np.ndarray, factor: int) -> np.ndarray:
-    """Average blocks of factor^2 pixels; the remainder on the right and below is cropped.
-
-    Colours are weighted by straight alpha, rgb = sum(rgb a) / sum(a); fully transparent blocks take the unweighted
-    mean.
-
-    Args:
-        picture: (H, W, 3 or 4) uint8.
-        factor: side of a block, pixels.
-    """
-    if factor == 1:
-        return picture
-    height, width = picture.shape[0] // factor, picture.shape[1] // factor
-    shape = (height, factor, width, factor, picture.shape[2])
-    blocks = picture[: height * factor, : width * factor].reshape(shape).astype(np.uint32)
-    area = factor * factor
-    mean = (_block_sum(blocks) + area // 2) // area
-    if picture.shape[2] == 4:
-        alpha = _block_sum(blocks[..., 3:])
-        rgb = _block_sum(blocks[..., :3] * blocks[..., 3:])
-        mean[..., :3] = np.where(alpha > 0, (rgb + alpha // 2) // np.maximum(alpha, 1), mean[..., :3])
-    return mean.astype(np.uint8)
-
-
-def _block_sum(blocks: np.ndarray) -> np.ndarray:
-    """Sum (H, factor, W, factor, C) uint32 to (H, W, C); adding slices is several times faster than sum((1, 3))."""
-    total = np.zeros_like(blocks[:, 0, :, 0])
-    for j, i in np.ndindex(blocks.shape[1], blocks.shape[3]):
-        total += blocks[:, j, :, i]
-    return total

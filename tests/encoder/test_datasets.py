@@ -16,7 +16,7 @@ import datasets as make
 from datasets import fails, load
 from kpc.encoder.datasets import load_dataset
 from kpc.encoder.datasets.capture import natural_key
-from kpc.encoder.datasets.loading import downscale_picture
+from kpc.encoder.datasets.decoded_pictures import downscale_picture
 from kpc.format.common.films import write_video
 from kpc.format.common.images import write_image
 

@@ -89,10 +89,14 @@ def test_a_dry_run_leaves_nothing(
     work = tmp_path / "set.kpc.work"
     work.mkdir()
     (work / CHECKPOINT).touch()  # of an interrupted run
-    assert kpenc.main([*words, "--json"]) == 0
-    names = {"train_s", "test_s", "rest_s", "memory_bytes", "test_pictures", "held_out_pictures"}
-    assert set(json.loads(capsys.readouterr().out)) == names
+    assert kpenc.main([*words, "--json", "--cache", "shared", "--downscale", "auto"]) == 0
+    names = {"train_s", "test_s", "rest_s", "memory_bytes", "test_pictures", "held_out_pictures", "disk_bytes"}
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    assert set(found) == names and "20 pixels across: --downscale 1 (auto: " in err
     assert [p.name for p in work.iterdir()] == [CHECKPOINT]
+    (pixels,) = (tmp_path / "shared").glob("*.bin")
+    assert found["disk_bytes"] == pixels.stat().st_size and str(pixels.relative_to(tmp_path)) in err
     assert kpenc.main([*words, "-o", "out.kpc", "--keep"]) == 0
     assert {p.suffix for p in (tmp_path / "out.kpc.work").iterdir()} == {".bin", ".json"}
     with pytest.raises(SystemExit, match="2"):

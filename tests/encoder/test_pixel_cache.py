@@ -11,7 +11,7 @@ import pytest
 
 import datasets as make
 from datasets import fails, load
-from kpc.encoder.datasets import PixelCache, pixel_cache
+from kpc.encoder.datasets import pixel_cache
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import write_image
 
@@ -69,7 +69,7 @@ def test_a_large_cache_does_not_become_resident(tmp_path: Path) -> None:
     with open(file, "wb") as out:
         out.truncate(3_000_000_000)
     tiles = tuple(pixel_cache.Tile(n * 1_000_000, 1000, 1000, 0) for n in range(1000))
-    cache = PixelCache(file, tiles, 3, 3)
+    cache = pixel_cache.FlatCache(file, tiles, 3, 3)
     rng = np.random.default_rng(0)
     before = resident_bytes()
     for _ in range(20):
