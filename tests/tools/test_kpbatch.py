@@ -287,8 +287,9 @@ def is_running(pid: int) -> bool:
 
 def test_changed_files_of_a_work_folder_reach_the_store(tmp_path: Path) -> None:
     work, store = tmp_path / "work", Store(str(tmp_path / "store"))
-    (work / "group-0000").mkdir(parents=True)
-    for name in ("group-0000/checkpoint.kpck", "pixels-1.bin", ".checkpoint.tmp"):
+    for name in ("group-0000", "pixels-2"):
+        (work / name).mkdir(parents=True)
+    for name in ("group-0000/checkpoint.kpck", "pixels-1.bin", "pixels-2/0000.bin", ".checkpoint.tmp"):
         (work / name).write_bytes(b"1")
     uploads = working.Uploads(work, store, "key/work")
     uploads.run()

@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +162,7 @@ class Uploads:
     def run(self) -> None:
         for file in sorted(self._work.rglob("*")):
             inner = file.relative_to(self._work)
-            if any(part.startswith(".") for part in inner.parts) or any(file.match(each) for each in LOCAL_FILES):
+            if any(fnmatch(part, each) for part in inner.parts for each in LOCAL_FILES):
                 continue
             with contextlib.suppress(FileNotFoundError):  # it has been removed or renamed
                 state = file.stat()
