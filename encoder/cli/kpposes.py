@@ -13,6 +13,7 @@ import sys
 
 from kpc.encoder.poses.document import write_document
 from kpc.encoder.poses.find import Found, find_poses
+from kpc.encoder.poses.page import NAME, write_page
 from kpc.encoder.poses.wishes import add_pose_options, wishes_from
 from kpc.format.common import cli
 
@@ -28,7 +29,10 @@ def _command(argv: list[str]) -> None:
     cli.check_writable(file)
     found = find_poses(options.folder, wishes_from(options))
     write_document(found, options.folder, file)
+    page = file.with_name(NAME)
+    write_page(found, f"Cameras of {options.folder.resolve().name}", page)
     print(report(found))
+    print(f"{page}: where the cameras stand, and what they see")
     print(f"{file}: {len(found.structure.views)} of {len(found.view_names)} placed")
 
 

@@ -279,7 +279,8 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--preview",
         action="store_true",
-        help="while training, keep a small picture of a held-out view beside what was filmed in OUTPUT.preview.png",
+        help="while training, keep a small picture of a held-out view beside what was filmed in OUTPUT.preview.png; "
+        "also show the cameras in OUTPUT.cameras.html",
     )
     parser.add_argument(
         "--keep-checkpoint",

@@ -1,19 +1,21 @@
 """Preparation of an encode: decode the dataset, find the space that it fills, lay out the model, resume a run."""
 
+import shutil
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from kpc.encoder.cli.grouped import initialise_from
 from kpc.encoder.cli.options import Options
-from kpc.encoder.cli.read_dataset import read_dataset
+from kpc.encoder.cli.read_dataset import PAGE, read_dataset
 from kpc.encoder.cli.report import SPACES, describe_model, describe_time_rows, log, show_progress
 from kpc.encoder.cli.sound import find_sound
 from kpc.encoder.cli.transcode import check_outputs
-from kpc.encoder.cli.work_folder import CHECKPOINT, choose_device, make_work_folder, remove_if_empty
+from kpc.encoder.cli.work_folder import CHECKPOINT, POSES, choose_device, make_work_folder, remove_if_empty
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.datasets.plausibility import doubts
-from kpc.encoder.evaluation.expectations import expect
+from kpc.encoder.evaluation.camera_page import write_page_of_dataset
+from kpc.encoder.evaluation.expectations import Expectations, expect
 from kpc.encoder.field.bounds import (
     find_box,
     find_contraction_box,
@@ -87,8 +89,21 @@ def prepare_setting(options: Options) -> Setting:
     log(f"filmed: {expectations.paragraph()}")
     for warning in expectations.warnings():
         log(f"warning: {warning}")
+    if options.preview is not None:
+        _show_cameras(options, dataset, expectations)
     is_final = options.box is not None or isinstance(mapping, Contraction)
     return Setting(dataset, aabb, mapping, is_final, sound=sound, sound_from=sound_from)
+
+
+def _show_cameras(options: Options, dataset: Dataset, expectations: Expectations) -> None:
+    """Write the page of the cameras beside the output: that of found cameras, or one of those that were given."""
+    page = options.output.with_name(options.output.name + ".cameras.html")
+    found = options.work_dir / POSES / PAGE
+    if found.exists():
+        shutil.copyfile(found, page)
+    else:
+        write_page_of_dataset(page, dataset, [dataset.describe(), f"Filmed: {expectations.paragraph()}"])
+    log(f"cameras: {page}")
 
 
 def prepare_trainer(options: Options, setting: Setting) -> Trainer:

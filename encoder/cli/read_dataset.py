@@ -15,6 +15,8 @@ from kpc.format.common.media_files import is_hidden, is_image, is_video
 
 # The file beside found cameras that says what they were found from.
 ASKED = "asked.json"
+# The page that shows them.
+PAGE = "cameras.html"
 
 
 def read_dataset(options: Options) -> Dataset:
@@ -83,11 +85,13 @@ def _find_poses(options: Options, file: Path, why: str) -> None:
     from kpc.encoder.cli.kpposes import report  # needs packages that other encodes do not
     from kpc.encoder.poses.document import write_document
     from kpc.encoder.poses.find import find_poses
+    from kpc.encoder.poses.page import write_page
 
     print(f"{options.source}: {why}; finding the cameras", file=sys.stderr)
     found = find_poses(options.source, options.wishes)
     shutil.rmtree(file.parent, ignore_errors=True)
     file.parent.mkdir(parents=True)
     write_document(found, options.source, file)
+    write_page(found, f"Cameras of {options.source.resolve().name}", file.parent / PAGE)
     (file.parent / ASKED).write_text(json.dumps(_asked(options)))
     print(report(found), file=sys.stderr)

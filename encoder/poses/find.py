@@ -3,7 +3,7 @@
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +46,7 @@ class Found:
         view_names: of the views: cameras, or pictures of a moving one.
         structure: z up; the rig's extent is 1 unless `is_metric`.
         is_metric: whether the unit is the metre.
+        motion: of each camera of a still rig, how much moves before each frame.
     """
 
     kind: str
@@ -54,6 +55,7 @@ class Found:
     view_names: tuple[str, ...]
     structure: Structure
     is_metric: bool
+    motion: tuple[np.ndarray, ...] = ()
 
 
 def find_poses(root: Path, wishes: Wishes) -> Found:
@@ -132,7 +134,8 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
             file=sys.stderr,
         )
     assert best is not None
-    return Found("still rig", footage, tuple(clocks), tuple(names), best, False)
+    motion = tuple(seen.motion for seen in surveys)
+    return Found("still rig", footage, tuple(clocks), tuple(names), best, False, motion)
 
 
 def _warn_of_unknown(root: Path, names: Sequence[str], clocks: Sequence[Clock]) -> None:
@@ -218,7 +221,7 @@ def _scaled(root: Path, found: Found, wishes: Wishes) -> Found:
         first, second = (views[number].camera_to_world[:3, 3] for number in numbers)
         scale = metres / max(float(np.linalg.norm(first - second)), 1e-12)
     structure = oriented(found.structure, scale)
-    return Found(found.kind, found.footage, found.clocks, found.view_names, structure, is_metric)
+    return replace(found, structure=structure, is_metric=is_metric)
 
 
 def depth_range(structure: Structure, number: int, view: PlacedView) -> tuple[float, float] | None:

@@ -65,6 +65,13 @@ def test_videos_are_brought_in_step_by_what_moves(document):
     assert offsets - offsets[0] == pytest.approx(np.array(LATE) / FPS, abs=0.5 / FPS)
 
 
+def test_a_page_shows_the_cameras(room, document):
+    page = (room.parent / "cameras.html").read_text()
+    assert "still rig: 5 of 5 placed" in page
+    assert page.count("<polyline") == page.count("<img") == 5
+    assert page.count("<td>motion</td>") == 5
+
+
 def test_the_world_is_upright_and_in_metres(document):
     poses = np.array([frame["transform_matrix"] for frame in document["frames"]])
     assert np.linalg.norm(poses[0, :3, 3] - poses[4, :3, 3]) == pytest.approx(1.5, rel=1e-6)
