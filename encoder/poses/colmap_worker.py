@@ -92,7 +92,9 @@ def _features(folder: Path, job: dict[str, Any]) -> list[tuple[np.ndarray, np.nd
     database = pycolmap.Database.open(file)
     found = []
     for picture in job["pictures"]:
-        number = database.read_image_with_name(picture["file"]).image_id
+        image = database.read_image_with_name(picture["file"])
+        assert image is not None
+        number = image.image_id
         places = np.asarray(database.read_keypoints(number), np.float32).reshape(-1, 6)
         used = np.ones(len(places), bool)
         if picture["mask"] is not None:  # (H, W) bool

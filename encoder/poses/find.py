@@ -26,7 +26,7 @@ ATTEMPTS = ((4096, 4), (8192, 10))
 # Features in each picture of a moving camera or a collection of more than MANY.
 FEATURES_OF_MANY = 2048
 # Pictures of one moving camera are matched with those so many frames away, and with some that look alike.
-FRAMES = Pairing((1, 2, 3, 4, 6, 8, 12, 16, 24, 32), alike=5, every=3)
+FRAMES = Pairing((1, 2, 4, 8, 16, 32), alike=5, every=3)
 # Photographs are matched with those that look alike, and with the next ones, which mostly were taken there, too.
 PHOTOGRAPHS = Pairing((1, 2), alike=20)
 # A scene cannot be made from fewer cameras.
