@@ -179,10 +179,12 @@ def _check_bounds(value: Any, where: str, depth: int) -> None:
 
 def _check_text(text: str, where: str, allowed: str) -> None:
     is_unicode = text.encode(errors="replace").decode() == text  # False if a surrogate stands alone
-    if len(text) > TEXT_LIMIT or not is_unicode or UNPRINTABLE.search(text.replace(allowed, "") if allowed else text):
-        raise FormatError(
-            f"{where}: a text is longer than {TEXT_LIMIT:,} characters, holds control characters or is not Unicode"
-        )
+    if len(text) > TEXT_LIMIT:
+        raise FormatError(f"{where}: a text has {len(text):,} characters, more than {TEXT_LIMIT:,}")
+    if not is_unicode:
+        raise FormatError(f"{where}: a text is not Unicode")
+    if UNPRINTABLE.search(text.replace(allowed, "") if allowed else text):
+        raise FormatError(f"{where}: a text holds tabs or other control characters")
 
 
 def mismatch(value: Any, schema: Mapping[str, Any], where: str = "the object") -> str | None:
@@ -207,9 +209,10 @@ def mismatch(value: Any, schema: Mapping[str, Any], where: str = "the object") -
     elif isinstance(value, dict):
         return _member_mismatch(value, schema, where)
     elif not isinstance(value, bool):
-        within = schema.get("minimum", -math.inf) <= value <= schema.get("maximum", math.inf)
-        if not (within and value > schema.get("exclusiveMinimum", -math.inf)):
-            return f"{where} is {value:g}, outside its range"
+        above = schema.get("exclusiveMinimum", -math.inf)
+        low, high = schema.get("minimum", above), schema.get("maximum", math.inf)
+        if not (low <= value <= high and value > above):
+            return f"{where} is {value:g}, outside its range from {low:g} to {high:g}"
     return None
 
 

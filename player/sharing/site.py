@@ -131,11 +131,25 @@ def copy_player(folder: Path) -> None:
     write_file(folder / "page.css", (files(__package__) / "page.css").read_bytes())
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse a folder in which another page than one of this module would be replaced."""
+def check_folder(folder: Path, scenes: Mapping[str, Path]) -> None:
+    """Refuse a folder in which what this module did not write would be replaced.
+
+    Args:
+        folder: that is to be written.
+        scenes: the files that are copied into it, by their names there. Others of these names are taken for earlier
+            ones where the folder has a page of this module.
+
+    Raises:
+        UsageError: a page or a file would be replaced.
+    """
     page = folder / PAGE
-    if page.exists() and GENERATOR not in page.read_text(errors="replace"):
-        raise UsageError(f"{page}: is not a page of kpshare and stays; choose another folder with -o")
+    if page.exists():
+        if GENERATOR not in page.read_text(errors="replace"):
+            raise UsageError(f"{page}: is not a page of kpshare and stays; choose another folder with -o")
+        return
+    for name, source in scenes.items():
+        if (folder / name).exists() and not (source.exists() and (folder / name).samefile(source)):
+            raise UsageError(f"{folder / name}: is another file, and stays; choose another folder with -o")
 
 
 def write_file(path: Path, content: str | bytes) -> None:

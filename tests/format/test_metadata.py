@@ -3,6 +3,7 @@
 import argparse
 import copy
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -127,6 +128,19 @@ def test_a_clip_has_its_own_metadata_and_groups_keep_theirs(tmp_path):
     groups.write(parts, tmp_path / "named.kpc", Metadata({"title": "Both"}))
     again = groups.group_inputs([tmp_path / "named.kpc", tmp_path / "named.kpc"][:1])
     assert [part.metadata.title for part in again] == ["Both", "Both"]
+
+
+@pytest.mark.parametrize(
+    ("members", "words"),
+    [
+        ({"title": "a\tb"}, "title: a text holds tabs"),
+        ({"description": "x" * 4097}, "has 4,097 characters, more than 4,096"),
+        ({"metres_per_unit": 1e30}, "is 1e+30, outside its range from "),
+    ],
+)
+def test_what_is_wrong_with_metadata_is_said(members, words):
+    with pytest.raises(FormatError, match=re.escape(words)):
+        pack_metadata(Metadata(members))
 
 
 def places(value, path=()):

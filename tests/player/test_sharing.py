@@ -141,6 +141,13 @@ def test_what_cannot_be_shared_is_refused(
     assert code == 2 and reason in capsys.readouterr().err and not (tmp_path / "site").exists()
 
 
+def test_another_file_of_the_name_of_the_scene_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / SAMPLE.name).write_text("mine")
+    assert kpshare.main([str(SAMPLE), "-o", str(tmp_path)]) == 2
+    assert f"{SAMPLE.name}: is another file, and stays" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == [SAMPLE.name]
+
+
 def test_what_is_no_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.kpc").write_bytes(b"no scene")
     assert kpshare.main([str(tmp_path / "a.kpc"), "-o", str(tmp_path / "site")]) == 1

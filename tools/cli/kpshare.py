@@ -40,11 +40,12 @@ def _command(argv: list[str]) -> None:
     is_gallery = options.gallery is not None or len(files) > 1
     folder = options.output
     cli.check_writable(folder, is_folder=True)
-    site.check_folder(folder)
     names = site.distinct_names([file.stem for file in files])
     folders = [folder / name if is_gallery else folder for name in names]
-    for one in folders if is_gallery else ():
-        site.check_folder(one)
+    if is_gallery:
+        site.check_folder(folder, {})
+    for file, name, place in zip(files, names, folders, strict=True):
+        site.check_folder(place, {f"{name}.kpc": file})
     root = "../" if is_gallery else ""
     with tempfile.TemporaryDirectory() as aside:
         # Nothing is written into the folder if one of the scenes cannot be read.
