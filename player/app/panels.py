@@ -140,8 +140,8 @@ class Panels:
         # One line of these, since the panel is as high as a window of 480 rows permits.
         if not stream.is_settled:
             share = stream.loaded_fraction
-            rate = f"{share:.0%} loaded, {stream.bytes_per_s / 1e3:,.0f} KB/s"
-            imgui.text_disabled("loading the next group" if share >= 1 else rate)
+            arrived = f"{share:.0%} loaded, {stream.bytes_per_s / 1e3:,.0f} KB/s"
+            imgui.text_disabled("loading the next group" if share >= 1 else arrived)
         elif view.renderer.is_loading:
             imgui.text_disabled("compiling faster code")
         elif isinstance(self.state.scene.decoder, HybridDecoder):
