@@ -180,7 +180,7 @@ def _check_bounds(value: Any, where: str, depth: int) -> None:
 def _check_text(text: str, where: str, allowed: str) -> None:
     is_unicode = text.encode(errors="replace").decode() == text  # False if a surrogate stands alone
     if len(text) > TEXT_LIMIT:
-        raise FormatError(f"{where}: a text has {len(text):,} characters, more than {TEXT_LIMIT:,}")
+        raise FormatError(f"{where}: a text is longer than {TEXT_LIMIT:,} characters, by {len(text) - TEXT_LIMIT:,}")
     if not is_unicode:
         raise FormatError(f"{where}: a text is not Unicode")
     if UNPRINTABLE.search(text.replace(allowed, "") if allowed else text):

@@ -134,7 +134,7 @@ def test_a_clip_has_its_own_metadata_and_groups_keep_theirs(tmp_path):
     ("members", "words"),
     [
         ({"title": "a\tb"}, "title: a text holds tabs"),
-        ({"description": "x" * 4097}, "has 4,097 characters, more than 4,096"),
+        ({"description": "x" * 4097}, "a text is longer than 4,096 characters, by 1"),
         ({"metres_per_unit": 1e30}, "is 1e+30, outside its range from "),
     ],
 )
