@@ -61,6 +61,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
     grad_basis = np.zeros((n, 3, layout.features), np.float32)
     planes = fused.planes_of(field)
     grad_motion = np.zeros((workers, *planes.motion.shape), np.float32)
+    grad_rays = np.zeros((n, kernels.RAY_GRADIENTS), np.float32)
     peaks = np.zeros((workers, *scene.occupancy.shape[1:]), np.float32)
     errors, counts = kernels.backpropagate(
         planes,
@@ -70,7 +71,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         basis,
         targets.numpy(),
         np.float32(DISTORTION),
-        kernels.Gradients(grad, grad_density, grad_basis, grad_motion, scene.motion is not None),
+        kernels.Gradients(grad, grad_density, grad_basis, grad_motion, scene.motion is not None, grad_rays, True),
         peaks,
         fused.max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
     )
@@ -79,6 +80,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         "density": grad_density.sum(0),
         "basis": grad_basis,
         "motion": grad_motion.sum(0),
+        "rays": grad_rays,
         "errors": errors,
         "counts": counts,
         "peaks": peaks.max(0),
@@ -88,13 +90,14 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
 def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict[str, np.ndarray]:
     """Return the same gradients by autograd through `render_reference`, in float64."""
     field = Field.from_scene(scene).double()
-    rays = rays.map(torch.Tensor.double)
+    rays = rays.map(lambda values: values.double().requires_grad_())
     basis = field.basis(rays.directions).detach().requires_grad_()
     # The kernels give the gradient of the basis, the field goes without one.
     field.ray_terms = lambda directions, codes: basis  # type: ignore[method-assign]
     field.colours = lambda latent, terms, ray: torch.sigmoid(torch.einsum("nf,ncf->nc", latent, terms[ray]))  # type: ignore[method-assign]
     aabb, occupancy = torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy)
     rgb, distortion, weights, cells = render_reference(field, rays, aabb, occupancy, scene.step, mapping=scene.mapping)
+    rgb.retain_grad()
     squared = (rgb - targets.double()).square()
     (squared.mean() + DISTORTION * distortion).backward()
     peaks = torch.zeros(scene.occupancy.shape[1:], dtype=torch.float64)
@@ -105,6 +108,7 @@ def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict
         "theta": field.theta.grad.numpy(),
         "density": field.density.grad.numpy(),
         "basis": basis.grad.numpy(),
+        "rays": torch.cat([rays.origins.grad, rays.directions.grad, rays.times.grad[:, None], rgb.grad], 1).numpy(),
         "motion": None if field.motion is None else field.motion.grad.numpy(),
         "errors": squared.sum(1).detach().numpy(),
         "samples": len(weights),

@@ -91,7 +91,9 @@ def test_products_of_six_values_near_1e_minus_6_and_1e6(large: int, order: int) 
     exact = np.prod(values.astype(np.float32).astype(np.float64))
     assert features[0, 0] == pytest.approx(exact, rel=1e-6)
     grad = np.zeros((1, layout.size), np.float32)
-    kernels.scatter_features(planes, grad, planes.motion[None], *corner, np.ones((1, 1), np.float32))
+    kernels.scatter_features(
+        planes, grad, planes.motion[None], np.zeros((0, 4), np.float32), *corner, np.ones((1, 1), np.float32)
+    )
     for (_, name, start, *_), value in zip(layout.planes(), values, strict=True):
         assert grad[0, start] == pytest.approx(exact / float(np.float32(value)), rel=1e-5), name
 

@@ -24,6 +24,8 @@ from kpc.encoder.cli.sound import sound_of_span
 from kpc.encoder.cli.transcode import combine_figures
 from kpc.encoder.cli.work_folder import clear_work_folder
 from kpc.encoder.rdo.codec_model import load_checkpoint
+from kpc.encoder.training.importance import has_static_cameras
+from kpc.encoder.training.refinement import with_corrections
 from kpc.format.common import cli
 from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.container import groups, scene_io
@@ -64,6 +66,9 @@ def encode_groups(options: Options) -> dict[str, Any]:
         else:
             before = None if number == numbers[0] else group_path(work, number - 1).with_suffix(".kpck")
             found.append(_encode_group(group_options, setting_of_span(setting, span), before))
+        if number == numbers[0] and found[0]["refine"] != "none" and has_static_cameras(setting.dataset):
+            corrected = with_corrections(setting.dataset, found[0]["corrections"])
+            setting = replace(setting, dataset=corrected, refined=found[0]["refine"])
     parts = [groups.GroupInput.of(group_path(work, number), spans[number].start) for number in numbers]
     figures = _combine(found, [spans[number] for number in numbers], 0, options)
     size = _join(parts, clip_metadata([part.metadata for part in parts], figures), options)
@@ -144,7 +149,7 @@ def _read_finished(path: Path, options: Options) -> dict[str, Any]:
                 "--resume"
             )
         found: dict[str, Any] = kept["found"]
-        if missing := {*GROUP_FIGURES, *SUMMED_FIGURES, "test_psnr_moving"} - found.keys():
+        if missing := {*GROUP_FIGURES, *SUMMED_FIGURES, "test_psnr_moving", "refine"} - found.keys():
             raise KeyError(*missing)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainingError(f"{path}: its figures cannot be read; delete it to have the group encoded anew") from error

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,14 @@ import numpy as np
 from kpc.encoder.cli.metadata import describe, hash_dataset, reserve_figures, with_figures
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import Setting, prepare_trainer
-from kpc.encoder.cli.report import SPACES, describe_occupancy, describe_pruning, log, show_progress
+from kpc.encoder.cli.report import (
+    SPACES,
+    describe_corrections,
+    describe_occupancy,
+    describe_pruning,
+    log,
+    show_progress,
+)
 from kpc.encoder.cli.transcode import coding_figures
 from kpc.encoder.cli.work_folder import CHECKPOINT, clear_work_folder, save_scene
 from kpc.encoder.datasets import Dataset
@@ -27,6 +34,7 @@ from kpc.encoder.field.occupancy_grid import merge_slots
 from kpc.encoder.rdo.codec_model import CodedModel, Model, code
 from kpc.encoder.rdo.model_checkpoint import save_checkpoint
 from kpc.encoder.rdo.sequential_finetune import steps_per_group
+from kpc.encoder.training.refinement import Correction
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common import interrupts
 from kpc.format.common.compiling import working_s
@@ -60,11 +68,15 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         if not _wants_partial(trainer, checkpoint, may_ask=options.group_s is None):
             raise
 
+    corrections = _align(trainer)
+    dataset = trainer.refined_dataset()
     if trainer.config.summed:
         return _evaluate_unwritable(trainer, options, started)
     scene, pictures = to_scene(trainer), _select_cameras(dataset)
-    described = replace(options, audio=setting.sound_from)
-    metadata = describe(described, dataset, scene, pictures, setting.dataset_sha256 or hash_dataset(dataset))
+    refine = trainer.config.refine if setting.refined == "none" else setting.refined
+    described = replace(options, audio=setting.sound_from, refine=Options.refine if refine == "none" else refine)
+    dataset_sha256 = setting.dataset_sha256 or hash_dataset(setting.dataset)
+    metadata = describe(described, dataset, scene, pictures, dataset_sha256)
     scene = replace(scene, metadata=metadata, sound=setting.sound)
     coding_from_s = working_s()
     coded = _code(trainer, scene, reserve_figures(options))
@@ -93,6 +105,8 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         "space": SPACES[type(trainer.mapping)][0],
         "appearance": trainer.config.appearance,
         "appearances": len(trainer.names),
+        "refine": refine,
+        "corrections": [asdict(one) for one in corrections],
         "sound": None if setting.sound is None else setting.sound_from,
         **figures,
         **coding_figures(coded, size, options.trade, "training views"),
@@ -103,6 +117,16 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         "rays_per_s": trainer.rays_per_second,
         "peak_memory_bytes": peak_memory_bytes(),
     }
+
+
+def _align(trainer: Trainer) -> list[Correction]:
+    """Align held-out cameras with the scene, and log the corrections of all, where cameras are refined."""
+    if trainer.cameras is None:
+        return []
+    trainer.align_held_out()
+    corrections = trainer.cameras.corrections()
+    log(describe_corrections(corrections, 1 / trainer.dataset.clip.fps))
+    return corrections
 
 
 def _most_tested(options: Options, renderer: SceneRenderer, trainer: Trainer) -> int:
@@ -153,7 +177,9 @@ def _evaluate_unwritable(trainer: Trainer, options: Options, started: float) -> 
     """Return what was measured on a model that no file can hold; fewer figures than `encode_scene` returns."""
     scene = to_scene(trainer)
     most = _most_tested(options, SceneRenderer(scene, trainer.field), trainer)
-    test = evaluate(scene, trainer.dataset, most=most, field=trainer.field, label="testing the model", parts=True)
+    test = evaluate(
+        scene, trainer.refined_dataset(), most=most, field=trainer.field, label="testing the model", parts=True
+    )
     if not options.keep:
         clear_work_folder(options.work_dir, options.cache)
     return {
@@ -162,6 +188,7 @@ def _evaluate_unwritable(trainer: Trainer, options: Options, started: float) -> 
         "seed": options.seed,
         "steps": trainer.step,
         **_test_figures(test, trainer.dataset),
+        "refine": trainer.config.refine,
         "train_s": trainer.elapsed_s,
         "encode_s": time.monotonic() - started,
     }
@@ -169,7 +196,7 @@ def _evaluate_unwritable(trainer: Trainer, options: Options, started: float) -> 
 
 def to_scene(trainer: Trainer) -> Scene:
     """Return the trained field with its final occupancy and a selection of the cameras, the most central first."""
-    dataset = trainer.dataset
+    dataset = trainer.refined_dataset()
     slots = min(MAX_SLOTS, dataset.clip.frame_count) if dataset.is_dynamic else 1
     occupancy = merge_slots(
         trainer.grid.sample_slots(trainer.density_at, np.random.default_rng(trainer.config.seed), slots)

@@ -12,7 +12,7 @@ from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation.ablations import ABLATIONS, BASELINE
 from kpc.encoder.evaluation.testing_time import FEWEST_PICTURES
 from kpc.encoder.field.appearances import choose_appearance
-from kpc.encoder.field.config import APPEARANCES, PRESETS, PROGRESSIVE_SCALE_DROPOUT, TrainConfig
+from kpc.encoder.field.config import APPEARANCES, PRESETS, PROGRESSIVE_SCALE_DROPOUT, REFINEMENTS, TrainConfig
 from kpc.encoder.poses.wishes import Wishes, add_pose_options, wishes_from
 from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, Trade
 from kpc.format.common import cli
@@ -74,6 +74,7 @@ class Options:
     space: str = "auto"
     box: tuple[float, ...] | None = None
     appearance: str = "auto"
+    refine: str = "auto"
     work: Path | None = None
     cache: Path | None = None
     keep: bool = False
@@ -120,6 +121,7 @@ class Options:
             steps=self.steps or config.steps,
             tune_steps=config.tune_steps if self.tune_steps is None else self.tune_steps,
             appearance=appearance,
+            refine=self.refine_of(dataset)[0],
             view_dependent=config.view_dependent or appearance != "none",  # embeddings act through the direction MLP
         )
         return ABLATIONS[self.ablation](config)
@@ -130,6 +132,16 @@ class Options:
             return self.appearance, "as given"
         kind, why = choose_appearance(dataset)
         return kind, f"{why}; --appearance overrides"
+
+    def refine_of(self, dataset: Dataset) -> tuple[str, str]:
+        """Return what of the cameras is refined (`TrainConfig.refine`), and the reason, for the log."""
+        if self.refine != "auto":
+            return self.refine, "as given"
+        if not dataset.poses_found:
+            return "none", "the poses were given; --refine overrides"
+        has_clocks = any(clock != (0.0, 1.0) for clock in dataset.clocks.values())
+        found = "poses and clocks were" if has_clocks else "the poses were"
+        return "all" if has_clocks else "cameras", f"{found} found from the pictures; --refine overrides"
 
 
 def parse(argv: list[str]) -> tuple[Options, bool, bool]:
@@ -234,6 +246,14 @@ def _add_dataset_options(parser: argparse.ArgumentParser) -> None:
         default=Options.appearance,
         help="learn an appearance embedding for each camera or each image: unequal exposure, white balance, weather; "
         "auto: image for photographs by many lenses, else none (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--refine",
+        choices=("auto", *REFINEMENTS),
+        default=Options.refine,
+        help="learn small corrections of the cameras with the scene: of poses, focal lengths and distortion "
+        "(cameras), or of clocks and exposures, too (all); auto: cameras that kpenc or kpposes found, and all if "
+        "their clocks were found, too; none for poses that were given (default: %(default)s)",
     )
 
 
@@ -382,6 +402,7 @@ def _options_from(given: argparse.Namespace) -> Options:
         space=given.space,
         box=given.box,
         appearance=given.appearance,
+        refine=given.refine,
         work=given.work,
         cache=given.cache,
         keep=given.keep,

@@ -8,7 +8,7 @@ import numpy as np
 from kpc.encoder.cli.grouped import initialise_from
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.read_dataset import PAGE, read_dataset
-from kpc.encoder.cli.report import SPACES, describe_model, describe_time_rows, log, show_progress
+from kpc.encoder.cli.report import REFINED, SPACES, describe_model, describe_time_rows, log, show_progress
 from kpc.encoder.cli.sound import find_sound
 from kpc.encoder.cli.transcode import check_outputs
 from kpc.encoder.cli.work_folder import CHECKPOINT, POSES, choose_device, make_work_folder, remove_if_empty
@@ -50,6 +50,7 @@ class Setting:
         dataset_sha256: of the dataset of which this is a part; None if it is a whole.
         sound: of the clip; None if it is silent.
         sound_from: the track that it is from, as --audio names it.
+        refined: what of the cameras an earlier group of the clip has refined.
     """
 
     dataset: Dataset
@@ -60,6 +61,7 @@ class Setting:
     dataset_sha256: str | None = None
     sound: Sound | None = None
     sound_from: str = Options.audio
+    refined: str = "none"
 
 
 def prepare_setting(options: Options) -> Setting:
@@ -116,6 +118,12 @@ def prepare_trainer(options: Options, setting: Setting) -> Trainer:
     config, resolution = fit_frames_per_row(options.config(dataset), dataset)
     if dataset.is_dynamic:
         log(describe_time_rows(config, dataset, resolution))
+    if setting.refined != "none":
+        config = replace(config, refine="none")
+        log("cameras: as refined in the first group")
+    else:
+        kind, why = options.refine_of(dataset)
+        log(f"cameras: {REFINED[kind]} ({why})")
     if setting.before is not None:
         config = replace(config, coarse_until=0.0)  # the scene before has all scales
     resumes, survey_s = options.resume and checkpoint.exists(), 0.0

@@ -1,8 +1,11 @@
 """What kpenc prints: log lines on stderr while it runs, and the results on stdout."""
 
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
+
+import numpy as np
 
 from kpc.encoder.cli.estimate import Estimate
 from kpc.encoder.cli.options import Options
@@ -11,6 +14,7 @@ from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows
 from kpc.encoder.rdo.prune import Pruned
+from kpc.encoder.training.refinement import Correction
 from kpc.encoder.training.temporal_resolution import TimeResolution
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.cli import print_json
@@ -24,6 +28,16 @@ SPACES = {
     Contraction: ("contracted", "contracted beyond a box"),
     DeviceCoordinates: ("ndc", "device coordinates of a rig that faces one way"),
 }
+
+# How the log describes what --refine names.
+REFINED = {
+    "none": "not refined",
+    "cameras": "poses, focal lengths and distortion are refined",
+    "all": "poses, focal lengths, distortion, clocks and exposures are refined",
+}
+
+# The most cameras of which a table is printed.
+TABLE_ROWS = 40
 
 
 def log(text: str) -> None:
@@ -89,6 +103,33 @@ def describe_pruning(scene: Scene, pruned: Pruned, spare_db: float) -> str:
     return f"{text}\nchannels kept: {kept}, a loss of {pruned.loss_db:.3f} dB, {spare_db:.3f} allowed"
 
 
+def describe_corrections(corrections: Sequence[Correction], frame_s: float) -> str:
+    """Describe how far cameras were moved, in a table; of more than TABLE_ROWS the median and the largest.
+
+    `frame_s` is the time of a frame.
+    """
+    numbers = np.array(
+        [
+            [c.turned_degrees, 100 * c.moved_share, 100 * (c.focal - 1), 1000 * frame_s * c.late_frames]
+            + [100 * (gain - 1) for gain in c.exposure]
+            for c in corrections
+        ]
+    )
+    if len(numbers) > TABLE_ROWS:
+        sizes = np.abs(numbers)
+        numbers, names = np.stack([np.median(sizes, axis=0), sizes.max(0)]), ["median", "largest"]
+    else:
+        names = [c.camera for c in corrections]
+    heads = ("turned", "moved", "focal", "clock", "red", "green", "blue")
+    units = ("degrees", "% of rig", "%", "ms", "%", "%", "%")
+    shown = [k for k in range(len(heads)) if k < 3 or numbers[:, k].any()]
+    rows = [["camera", *(f"{heads[k]} {units[k]}" for k in shown)]]
+    rows += [[name, *(f"{row[k]:.3f}" for k in shown)] for name, row in zip(names, numbers, strict=True)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join(["corrections of the cameras:", *lines])
+
+
 def print_result(result: dict[str, Any], options: Options, as_json: bool) -> None:
     """Print the result of an encode, or of a transcode where the source is a file."""
     if as_json:
@@ -109,6 +150,8 @@ def _print_encode(result: dict[str, Any], options: Options) -> None:
         )
         if result["appearances"]:
             quality += ", right halves, each in an appearance fitted to its left half"
+        if result["refine"] != "none":
+            quality += ", their cameras aligned with the scene"
     print(f"{options.output}: {quality} (rendered from the decoded file)")
     print(
         f"{result['size_bytes']:,} bytes, {result['bits_per_parameter']:.2f} bits per parameter of "

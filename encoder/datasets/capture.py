@@ -109,6 +109,7 @@ class Capture:
         fps: frames per second; None if the dataset does not give it.
         found: all images, or videos, in the folders that the layout reads.
         left_out: those of them that are not used for a reason that the layout has reported.
+        poses_found: whether `kpposes` found the poses.
     """
 
     layout: str
@@ -116,6 +117,7 @@ class Capture:
     fps: float | None
     found: tuple[Path, ...]
     left_out: tuple[Path, ...] = ()
+    poses_found: bool = False
 
 
 def image_view(

@@ -81,6 +81,7 @@ class Dataset:
         video_start_s: when the whole clip begins, in the seconds of the videos; None if the pictures are images.
         downscale: side of the blocks of pixels of the files that were averaged.
         clocks: of videos by their names: the offset and rate that make their times those of the clip.
+        poses_found: whether `kpposes` found the poses.
     """
 
     layout: str
@@ -96,6 +97,7 @@ class Dataset:
     video_start_s: float | None = None
     downscale: int = 1
     clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    poses_found: bool = False
 
     @property
     def is_monocular(self) -> bool:

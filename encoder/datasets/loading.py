@@ -216,6 +216,7 @@ def _load(
         video_start_s=video_start_s,
         downscale=downscale,
         clocks={view.file.relative_to(root).as_posix(): view.clock for view in views if view.video},
+        poses_found=capture.poses_found,
     )
 
 

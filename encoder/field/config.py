@@ -6,6 +6,9 @@ from kpc.format.common.errors import UsageError
 
 APPEARANCES = ("none", "camera", "image")
 
+# What is refined of cameras: nothing; poses, focal lengths and distortion; clocks and exposures, too.
+REFINEMENTS = ("none", "cameras", "all")
+
 
 @dataclass(frozen=True)
 class Variation:
@@ -108,6 +111,13 @@ class TrainConfig:
     seed: int = 0
     # Whether `for_single_object` may change this configuration for scenes of its kind.
     adapts_to_object: bool = True
+
+    # --- Refinement of cameras (`kpc.encoder.training.refinement`)
+
+    # What of them is learnt with the scene, one of REFINEMENTS.
+    refine: str = "none"
+    # Share of the run after which cameras are moved: there has to be a picture first.
+    refine_from: float = 0.1
 
     # --- Priors, each a weight on a mean over the texels of a plane, summed over planes and scales
 

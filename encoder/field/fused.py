@@ -47,7 +47,7 @@ def volume_of(aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: Spa
 def ray_batch(rays: Rays) -> kernels.RayBatch:
     """Return rays as the kernels take them; appearances are left out."""
     return kernels.RayBatch(
-        *(a.numpy() for a in (rays.origins, rays.directions, rays.times, rays.jitters, rays.backgrounds))
+        *(a.detach().numpy() for a in (rays.origins, rays.directions, rays.times, rays.jitters, rays.backgrounds))
     )
 
 
@@ -132,7 +132,7 @@ def march_scene(field: Field, rays: Rays, scene: Scene) -> tuple[Samples, RayWei
 
 
 class FusedFeatures(torch.autograd.Function):
-    """`Field.features` by the kernels; points and times have no gradient."""
+    """`Field.features` by the kernels."""
 
     @staticmethod
     def forward(ctx, theta, motion, layout, points, times):  # type: ignore[no-untyped-def]
@@ -145,9 +145,12 @@ class FusedFeatures(torch.autograd.Function):
         planes, workers = ctx.planes, numba.get_num_threads()
         g_theta = np.zeros((workers, planes.theta.size), np.float32)
         g_motion = np.zeros((workers, *planes.motion.shape), np.float32)
-        kernels.scatter_features(planes, g_theta, g_motion, *ctx.at, g.contiguous().numpy())
+        wants_points = any(ctx.needs_input_grad[3:])
+        g_points = np.zeros((len(g) if wants_points else 0, 4), np.float32)
+        kernels.scatter_features(planes, g_theta, g_motion, g_points, *ctx.at, g.contiguous().numpy())
         summed = (torch.from_numpy(a.sum(0)) if a.size else None for a in (g_theta, g_motion))
-        return *summed, None, None, None
+        at = torch.from_numpy(g_points)
+        return *summed, None, *((at[:, :3], at[:, 3]) if wants_points else (None, None))
 
 
 def fused_features(field: Field) -> Callable[[Tensor, Tensor], Tensor]:

@@ -132,7 +132,7 @@ def sample_rays(
 ) -> Samples:
     """Return the samples of rays in occupied cells.
 
-    Sample k of a ray lies at s = near + (k + jitter) * step.
+    Sample k of a ray lies at s = near + (k + jitter) * step. To a gradient of the rays, s is a constant.
 
     Args:
         rays: N rays. aabb: (2, 3). occupancy: (slots, Nz, Ny, Nx) bool. step: in s.
@@ -141,7 +141,7 @@ def sample_rays(
             depends on the data, so a GPU need not be waited for: samples beyond `capacity` are dropped, and those that
             fill it up have length 0 and lie on the last ray.
     """
-    near, far = ray_spans(rays, aabb, mapping)
+    near, far = (end.detach() for end in ray_spans(rays, aabb, mapping))
     if most is None:
         most = max(1, math.ceil(float((far - near).clamp(min=0).max()) / step))
     k = torch.arange(most, device=near.device)
@@ -162,6 +162,13 @@ def sample_rays(
         scale.flatten()[chosen],
         cell.flatten(0, 1)[chosen],
     )
+
+
+def follow_rays(samples: Samples, rays: Rays, aabb: Tensor, mapping: SpaceMapping | None) -> Samples:
+    """Return the samples with points and density scales as differentiable functions of the rays, at constant s."""
+    own = replace(rays, origins=rays.origins[samples.ray], directions=rays.directions[samples.ray])
+    u, scale = plane_coordinates(own, samples.s[:, None], aabb, mapping)
+    return replace(samples, points=u[:, 0], density_scale=scale[:, 0])
 
 
 def select_reached(samples: Samples, is_reached: Tensor, capacity: int) -> Samples:

@@ -1,5 +1,6 @@
 """One training step on the CPU: fused kernels for the planes and the explicit decoder's gradient."""
 
+from dataclasses import replace
 from typing import Any
 
 import numba
@@ -31,6 +32,7 @@ class FusedOptimiser:
 
     Attributes:
         timers: seconds spent, by part of a step.
+        ray_gradients: (N, RAY_GRADIENTS) of the last batch, where cameras are refined.
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class FusedOptimiser:
         self.mean, self.square = np.zeros_like(self.theta), np.zeros_like(self.theta)
         self._peaks = np.zeros((self.workers, *cells), np.float32)
         self.decoder = decoder_optimiser(field, config)
+        self.ray_gradients = np.zeros((1, kernels.RAY_GRADIENTS), np.float32)
 
     def peaks(self) -> np.ndarray:
         """Return the largest weight in each cell since the last call, (Nz, Ny, Nx) float32."""
@@ -81,9 +84,11 @@ class FusedOptimiser:
             mask = feature_mask(self.field, config, number, fraction)
             scales = int(mask.view(-1, layout.channels).any(1).sum())  # masked finer scales take no time either
             mask = mask[: scales * layout.channels]
+            if config.refine != "none":
+                batch = replace(batch, directions=batch.directions.detach().requires_grad_())
             basis = self._masked_basis(batch, mask)
             planes = fused.planes_of(self.field, scales)
-            gradients = self._new_gradients(len(basis), len(mask), planes.motion, number)
+            gradients = self._new_gradients(len(targets), len(mask), planes.motion, number)
         with self.timers("kernel"):
             bias = self.field.density.detach()[-1:]
             errors, counts = kernels.backpropagate(
@@ -104,6 +109,8 @@ class FusedOptimiser:
                 add_prior_gradients(self.field, self.theta, self.grad[0], config, variation, config.regularise_every)
         with self.timers("decoder"):
             self._step_decoder(basis, mask, gradients, rate)
+            if batch.directions.grad is not None:
+                self.ray_gradients[:, 3:6] += batch.directions.grad.numpy()
         with self.timers("adam"):
             learning_rate = config.learning_rate * rate
             kernels.adam(
@@ -118,15 +125,18 @@ class FusedOptimiser:
             basis = self.field.basis(batch.directions, self.field.appearance_codes(batch.appearances))
         return (basis[..., : len(mask)] * mask).contiguous()
 
-    def _new_gradients(self, bases: int, F: int, motion: np.ndarray, number: int) -> kernels.Gradients:
+    def _new_gradients(self, rays: int, F: int, motion: np.ndarray, number: int) -> kernels.Gradients:
         """Return `Gradients` for a step: the planes' buffers, and zeros."""
-        rows = bases if self.config.view_dependent else self.workers
+        rows, wants_rays = rays if self.config.view_dependent else self.workers, self.config.refine != "none"
+        self.ray_gradients = np.zeros((rays if wants_rays else 1, kernels.RAY_GRADIENTS), np.float32)
         return kernels.Gradients(
             self.grad,
             np.zeros((self.workers, F + 1), np.float32),
             np.zeros((rows, 3, F), np.float32),
             np.zeros((self.workers, *motion.shape), np.float32),
             motion.size > 0 and number % self.config.motion_every == 0,
+            self.ray_gradients,
+            wants_rays,
         )
 
     def _step_decoder(self, basis: torch.Tensor, mask: torch.Tensor, gradients: kernels.Gradients, rate: float) -> None:

@@ -8,14 +8,16 @@ import torch
 from kpc.encoder.datasets import Dataset, pixel_rays
 from kpc.encoder.field.render import Rays
 from kpc.encoder.training.importance import TileWeights
+from kpc.encoder.training.refinement import DrawnPixels, Refinement
 from kpc.format.scene.space import SpaceMapping
 
 
 class RaySampler:
-    """Draws usable pixels of the training pictures, uniformly or by weights, and makes their rays.
+    """Draws usable pixels of pictures, uniformly or by weights, and makes their rays.
 
     Attributes:
-        frames: (P, 4) int64, columns from and to and rows from and to around the opaque part of each training picture;
+        train: (T,) int64, the pictures to draw from.
+        frames: (P, 4) int64, columns from and to and rows from and to around the opaque part of each such picture;
             None without alpha, and with masks, which need not agree with it.
     """
 
@@ -23,11 +25,24 @@ class RaySampler:
     MARGIN = 0.03
 
     def __init__(
-        self, dataset: Dataset, mapping: SpaceMapping | None = None, appearances: np.ndarray | None = None
+        self,
+        dataset: Dataset,
+        mapping: SpaceMapping | None = None,
+        appearances: np.ndarray | None = None,
+        cameras: Refinement | None = None,
+        train: np.ndarray | None = None,
     ) -> None:
-        """`appearances`: (P,) int64 as from `assign_appearances`, or None where there are none."""
-        self.dataset, self.mapping, self.appearances = dataset, mapping, appearances
-        self.train = np.flatnonzero(~dataset.pictures.is_test)
+        """Prepare to draw.
+
+        Args:
+            dataset: with the pictures.
+            mapping: of the scene.
+            appearances: (P,) int64 as from `assign_appearances`, or None where there are none.
+            cameras: as corrected; None for those of the dataset.
+            train: the pictures to draw from; None for all that are not held out.
+        """
+        self.dataset, self.mapping, self.appearances, self.cameras = dataset, mapping, appearances, cameras
+        self.train = np.flatnonzero(~dataset.pictures.is_test) if train is None else train
         self.ends = np.cumsum(dataset.usable_counts[self.train])
         self.frames: np.ndarray | None = None
         if dataset.has_alpha and dataset.masks is None:
@@ -43,16 +58,18 @@ class RaySampler:
         object_rays: float = 0.0,
         weights: TileWeights | None = None,
     ) -> tuple[Rays, torch.Tensor]:
-        """Draw rays.
+        """Draw rays, as `draw_pixels` and `rays`; return them and the colours (N, 3) that they should have."""
+        return self.rays(rng, self.draw_pixels(rng, count, object_rays, weights), background)
+
+    def draw_pixels(
+        self, rng: np.random.Generator, count: int, object_rays: float = 0.0, weights: TileWeights | None = None
+    ) -> DrawnPixels:
+        """Draw N pixels, ordered by time.
 
         Args:
-            count: N, number of rays.
-            background: (3,) RGB, or None for a random one for each ray.
-            object_rays: share of the rays that are drawn from `frames`, where there are any.
+            count: N.
+            object_rays: share of the pixels that are drawn from `frames`, where there are any.
             weights: by which the others are drawn; None for uniform.
-
-        Returns:
-            The rays, and the colours (N, 3) that they should have.
         """
         pictures = self.dataset.pictures
         within = 0 if self.frames is None or not self.frame_ends[-1] else round(object_rays * count)
@@ -70,10 +87,25 @@ class RaySampler:
             row, column = np.concatenate([top + below, row]), np.concatenate([left + beside, column])
         # Rays of one time read the same rows of the space-time planes, which then stay in the cache.
         order = np.argsort(pictures.time[picture], kind="stable")
-        picture, row, column = picture[order], row[order], column[order]
+        return DrawnPixels(picture[order], row[order], column[order])
+
+    def rays(
+        self, rng: np.random.Generator, pixels: DrawnPixels, background: np.ndarray | None = None
+    ) -> tuple[Rays, torch.Tensor]:
+        """Return the rays of N pixels, and the colours (N, 3) that they should have.
+
+        `background` is RGB (3,), or None for a random one for each ray.
+        """
+        pictures, (picture, row, column), count = self.dataset.pictures, pixels, len(pixels.picture)
+        if self.cameras is None:
+            origins, directions = pixel_rays(pictures, picture, column, row, self.mapping)
+            times = pictures.time[picture]
+        else:
+            (origins, directions), times = self.cameras.rays(pixels), self.cameras.times(picture)
         inside = row * pictures.width[picture] + column
-        origins, directions = pixel_rays(pictures, picture, column, row, self.mapping)
         colours = self.dataset.pixels.read(pictures.offset[picture] + inside).astype(np.float32) / np.float32(255)
+        if self.cameras is not None:
+            colours[:, :3] /= self.cameras.exposures(picture)
         if background is None:
             backgrounds = rng.random((count, 3), dtype=np.float32)
         else:
@@ -83,7 +115,7 @@ class RaySampler:
             targets = targets * colours[:, 3:] + backgrounds * (1 - colours[:, 3:])
         jitters = rng.random(count, dtype=np.float32)
         numbers = None if self.appearances is None else self.appearances[picture]
-        batch = Rays.from_arrays(origins, directions, pictures.time[picture], jitters, backgrounds, appearances=numbers)
+        batch = Rays.from_arrays(origins, directions, times, jitters, backgrounds, appearances=numbers)
         return batch, torch.from_numpy(targets)
 
     def _frame(self, alpha: np.ndarray) -> tuple[int, int, int, int]:

@@ -62,6 +62,7 @@ def trim_box(
         cells_across=64,
         steps=steps,
         occupancy_start=64,
+        refine="none",
     )
     trainer = Trainer(dataset, coarse, aabb, "cpu", mapping=mapping)
     trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10, most_steps=MAX_STEPS)

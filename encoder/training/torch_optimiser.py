@@ -14,9 +14,10 @@ import torch
 from kpc.encoder.field.config import TrainConfig, Variation
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import fused_features, max_samples_per_ray, sample_rays_fused
+from kpc.encoder.field.kernels import RAY_GRADIENTS
 from kpc.encoder.field.priors import appearance_priors, motion_priors, plane_priors
 from kpc.encoder.field.proposals import ProposalLevel, Proposals, histogram_loss
-from kpc.encoder.field.render import Rays, Samples, sample_rays, select_reached, shade, weigh_samples
+from kpc.encoder.field.render import Rays, Samples, follow_rays, sample_rays, select_reached, shade, weigh_samples
 from kpc.encoder.training.cuda_graphs import GraphCache
 from kpc.encoder.training.optimisers import (
     Stopwatch,
@@ -89,6 +90,7 @@ class TorchOptimiser:
 
     Attributes:
         timers: seconds spent, by part of a step.
+        ray_gradients: as of `FusedOptimiser`; a GPU is waited for, and runs operation by operation, to have them.
     """
 
     def __init__(
@@ -106,7 +108,9 @@ class TorchOptimiser:
         self.timers = Stopwatch()
         self.device = field.theta.device
         self._on_gpu = self.device.type != "cpu"
-        self._captures = self._on_gpu and proposals is None
+        self._refines = config.refine != "none"
+        self.ray_gradients = np.zeros((1, RAY_GRADIENTS), np.float32)
+        self._captures = self._on_gpu and proposals is None and not self._refines
         self._cells = cells
         self._peaks = torch.zeros(cells, device=self.device)
         self._readback = DeferredReadback(self.device)
@@ -214,11 +218,14 @@ class TorchOptimiser:
         batch, targets = _unpack(packed, appearances)
         assert self._aabb is not None
         levels: list[ProposalLevel] = []
+        fixed = batch
+        if self._refines:
+            batch = batch.map(lambda values: values.detach().requires_grad_(values.is_floating_point()))
         if self.proposals is None:
-            samples = self._sample(plan, batch, occupancy)
+            samples = self._sample(plan, fixed, occupancy)
         else:
             samples, edges, levels = self.proposals.sample(
-                batch, self._aabb, self.mapping, self._cells, plan.number, self.fused
+                fixed, self._aabb, self.mapping, self._cells, plan.number, self.fused
             )
         taken = (samples.length > 0).sum()
         if plan.capacities is not None and self.proposals is None:
@@ -226,8 +233,13 @@ class TorchOptimiser:
             with torch.no_grad():
                 weighed = weigh_samples(field, batch, samples, self.features, plan.extent, mask)
             samples = select_reached(samples, weighed.reached & (samples.length > 0), plan.capacities[1])
+        if self._refines:
+            samples = follow_rays(samples, batch, self._aabb, self.mapping)
         weighed = weigh_samples(field, batch, samples, self.features, plan.extent, mask)
-        error = (shade(field, batch, weighed) - targets).square().mean()
+        colours = shade(field, batch, weighed)
+        if self._refines:
+            colours.retain_grad()
+        error = (colours - targets).square().mean()
         loss = error + config.distortion * weighed.distortion
         for level in levels:
             loss = loss + config.histogram * histogram_loss(edges, weighed.weights.view(len(targets), -1), level)
@@ -240,6 +252,10 @@ class TorchOptimiser:
         loss.backward()  # type: ignore[no-untyped-call]
         if field.motion is not None and not plan.moving:
             field.motion.grad = None
+        if self._refines:
+            parts = batch.origins, batch.directions, batch.times, colours
+            found = [_gradient(values).view(len(targets), -1) for values in parts]
+            self.ray_gradients = torch.cat(found, dim=1).cpu().numpy()
         _, ny, nx = self._cells
         flat = (samples.cell[:, 0] * ny + samples.cell[:, 1]) * nx + samples.cell[:, 2]
         self._peaks.view(-1).scatter_reduce_(0, flat, weighed.weights.detach(), "amax")
@@ -306,3 +322,8 @@ def _unpack(packed: torch.Tensor, appearances: torch.Tensor | None) -> tuple[Ray
         part.contiguous() for part in packed.split([3, 3, 3, 3, 1, 1], dim=1)
     )
     return Rays(origins, directions, times[:, 0], jitters[:, 0], backgrounds, appearances), targets
+
+
+def _gradient(values: torch.Tensor) -> torch.Tensor:
+    """Return the gradient of a tensor; zeros if nothing depends on it."""
+    return torch.zeros_like(values) if values.grad is None else values.grad

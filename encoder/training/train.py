@@ -5,7 +5,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +30,19 @@ from kpc.encoder.field.proposals import Proposals
 from kpc.encoder.training.checkpoint import save_state
 from kpc.encoder.training.fused_optimiser import FusedOptimiser
 from kpc.encoder.training.importance import TileWeights, has_static_cameras
+from kpc.encoder.training.refinement import Refinement
 from kpc.encoder.training.sampler import RaySampler
 from kpc.encoder.training.torch_optimiser import TorchOptimiser
 from kpc.format.common.compiling import MONITOR
 from kpc.format.common.errors import TrainingError
 from kpc.format.common.fidelity import psnr_from_mse
+from kpc.format.common.progress import progress
 from kpc.format.scene.scene import Scene
-from kpc.format.scene.space import Contraction, SpaceMapping
+from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
+
+# Steps by which held-out cameras are aligned with the finished scene, at most and as a share of those of the run, and
+# rays of each step for each of them.
+ALIGN_STEPS, ALIGN_SHARE, ALIGN_RAYS = 100, 0.1, 512
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,7 @@ class Trainer:
         elapsed_s: seconds of training, including those spent before on finding the box, but not on compiling kernels.
         timers: seconds by part of a step.
         names: of the appearances.
+        cameras: as corrected; None where they are not refined.
         slots: time slots of the occupancy grid.
         extent: longest edge of the box. step_length: of rays, in s.
     """
@@ -116,7 +123,12 @@ class Trainer:
         self.step = 0
         self.elapsed_s = elapsed_s
         self.samples_per_ray = float(config.samples_across)
-        self.sampler = RaySampler(dataset, mapping, appearances if self.names else None)
+        self.cameras: Refinement | None = None
+        if config.refine != "none":
+            centre = self.aabb.mean(0, dtype=np.float64)
+            centre = mapping.to_world(centre) if isinstance(mapping, DeviceCoordinates) else centre
+            self.cameras = Refinement(dataset, config, centre, mapping)
+        self.sampler = RaySampler(dataset, mapping, appearances if self.names else None, self.cameras)
         # Objects with alpha are shown on white; elsewhere an unknown background is grey, the guess of least error.
         self.background = np.full(3, 1.0 if dataset.has_alpha else 0.5, np.float32)
         self._weights: TileWeights | None = None
@@ -187,7 +199,8 @@ class Trainer:
         background = None if self.dataset.has_alpha else self.background
         with self.timers("rays"):
             weights = self._weights_at(fraction)
-            batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays, weights)
+            pixels = self.sampler.draw_pixels(self.rng, count, config.object_rays, weights)
+            batch, targets = self.sampler.rays(self.rng, pixels, background)
         rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
         squared_error, samples = self.optimiser.step(
             self.step,
@@ -202,9 +215,40 @@ class Trainer:
         )
         if not math.isfinite(squared_error):
             raise TrainingError(f"step {self.step}: {self._not_finite()}; try another --seed or --preset")
+        if self.cameras is not None and fraction >= config.refine_from:
+            with self.timers("cameras"):
+                self.cameras.step(pixels, targets.numpy(), self.optimiser.ray_gradients, _refinement_rate(fraction))
         self.samples_per_ray += 0.1 * (samples - self.samples_per_ray)
         self.step += 1
         return squared_error, count
+
+    def refined_dataset(self) -> Dataset:
+        """Return the dataset, its cameras as corrected."""
+        return self.dataset if self.cameras is None else self.cameras.refined()
+
+    def align_held_out(self) -> None:
+        """Align the refined poses of held-out cameras with the finished scene, which does not change.
+
+        The cameras that are trained on have moved, each for itself, so that a held-out camera no longer stands where
+        the scene agrees with it. BARF (arXiv:2104.06405) and others evaluate thus, too.
+        """
+        cameras = self.cameras
+        held_out = np.flatnonzero(cameras.is_held_out[cameras.unit]) if cameras is not None else np.zeros(0, int)
+        if cameras is None or not len(held_out):
+            return
+        sampler = RaySampler(self.dataset, self.mapping, None, cameras, held_out)
+        rng, steps = np.random.default_rng(self.config.seed), int(min(ALIGN_STEPS, ALIGN_SHARE * self.step))
+        count = min(self.rays_per_step, ALIGN_RAYS * int(cameras.is_held_out.sum()))
+        self.optimiser.config = replace(self.config, distortion=0.0)  # the field no longer adapts to it
+        for number in progress(range(steps), "aligning held-out cameras", unit="steps"):
+            pixels = sampler.draw_pixels(rng, count)
+            batch, targets = sampler.rays(rng, pixels, None if self.dataset.has_alpha else self.background)
+            # At a learning rate of 0 a step only finds gradients.
+            volume = self.aabb, self.grid.active, self.step_length, self.extent
+            self.optimiser.step(self.step, 1.0, 0.0, batch, targets, *volume)
+            rate = _refinement_rate(number / steps)
+            cameras.align(pixels, self.optimiser.ray_gradients, rate)
+        self.optimiser.config = self.config
 
     def _update_grid(self) -> None:
         """Update the occupancy grid where it is due at this step."""
@@ -313,6 +357,7 @@ class Trainer:
             "grid": self.grid.state(),
             "rng": _rng_to_plain(self.rng),
             "dataset": _fingerprint(self.dataset),
+            "cameras": self.cameras and self.cameras.state(),
         }
         save_state(path, state, "give another folder with --work")
 
@@ -353,6 +398,8 @@ class Trainer:
             self.field.load_state_dict(state["field"])
             self.optimiser.load(state["optimiser"])
             self.grid.load(state["grid"])
+            if self.cameras is not None:
+                self.cameras.load(state["cameras"])
             self.rng.bit_generator.state = _rng_from_plain(state["rng"])
             self.step, self.elapsed_s = state["step"], state["elapsed_s"]
             self.samples_per_ray = state["samples_per_ray"]
@@ -360,6 +407,11 @@ class Trainer:
             raise
         except Exception as error:  # a damaged file may raise anything
             raise _unusable(path, error) from error
+
+
+def _refinement_rate(fraction: float) -> float:
+    """Return the share of the peak learning rates of cameras at a fraction of the run."""
+    return 0.5 * (1 + math.cos(math.pi * fraction))
 
 
 def _named(config: dict[str, Any]) -> dict[str, Any]:
@@ -370,8 +422,9 @@ def _named(config: dict[str, Any]) -> dict[str, Any]:
         "--sampling": "proposals" if config["proposals"] else "grid",
         "--seed": config["seed"],
         "--appearance": config["appearance"],
+        "--refine": config["refine"],
     }
-    own = ("hybrid", "proposals", "seed", "appearance")
+    own = ("hybrid", "proposals", "seed", "appearance", "refine")
     return named | {name: value for name, value in config.items() if name not in own}
 
 

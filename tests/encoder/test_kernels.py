@@ -47,7 +47,7 @@ def test_backpropagate_equals_autograd_through_the_reference(kind: tuple[bool, b
     assert ours["counts"].sum() == theirs["samples"] > 403
     np.testing.assert_allclose(ours["errors"], theirs["errors"], atol=6 * COLOUR)  # d e^2 = 2 e de, three channels
     np.testing.assert_allclose(ours["peaks"], theirs["peaks"], atol=COLOUR)
-    for name in ("theta", "density", "basis", *(["motion"] if scene.motion is not None else [])):
+    for name in ("theta", "density", "basis", "rays", *(["motion"] if scene.motion is not None else [])):
         largest = np.abs(theirs[name]).max()
         assert largest > 0
         np.testing.assert_allclose(ours[name], theirs[name], atol=GRADIENT * largest, err_msg=name)

@@ -12,7 +12,7 @@ RESULT = {
     "held_out_pictures": 30, "appearances": 0, "size_bytes": 5000, "bits_per_parameter": 0.5, "parameters": 80000,
     "coding_loss_db": 0.1, "trade": "max_loss_db", "target": 0.15, "evaluated_on": "training views",
     "validation_loss_db": 0.1, "agreement_db": 40.0, "identity_share": None, "encode_s": 100.0, "train_s": 50.0,
-    "coding_s": 20.0, "steps": 300,
+    "coding_s": 20.0, "steps": 300, "refine": "none",
 }  # fmt: skip
 
 

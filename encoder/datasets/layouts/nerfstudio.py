@@ -21,6 +21,9 @@ from kpc.format.common.media_files import is_video
 # The layout's name in messages.
 NAME = "nerfstudio"
 
+# What a document of `kpposes` says it was made by.
+MADE_BY = "kpposes"
+
 
 def recognise(path: Path) -> bool:
     """Return whether the folder has this layout."""
@@ -66,4 +69,5 @@ def read(path: Path, holdout: str | None, transforms: Path | None = None) -> Cap
     )
     left_out = tuple(image for image, part in zip(images, split, strict=True) if part is None)
     in_folders = tuple(media for folder in sorted({image.parent for image in images}) for media in media_in(folder))
-    return Capture(NAME, views, frame_rate(file, document), in_folders, left_out)
+    is_ours = document.get("made_by") == MADE_BY
+    return Capture(NAME, views, frame_rate(file, document), in_folders, left_out, is_ours)

@@ -26,13 +26,14 @@ Numba's on-disk cache notices a change in the file of the function that was call
 it calls: after editing a module here, delete `__pycache__`.
 """
 
-from kpc.encoder.field.kernels.arguments import Gradients, PlaneSet, RayBatch, SampleArrays, Volume
+from kpc.encoder.field.kernels.arguments import RAY_GRADIENTS, Gradients, PlaneSet, RayBatch, SampleArrays, Volume
 from kpc.encoder.field.kernels.backward import backpropagate
 from kpc.encoder.field.kernels.marching import collect_samples, render
 from kpc.encoder.field.kernels.points import features, log_densities, scatter_features
 from kpc.encoder.field.kernels.updates import adam, add_sparse_transients, add_time_smoothness, add_variation
 
 __all__ = [
+    "RAY_GRADIENTS",
     "Gradients",
     "PlaneSet",
     "RayBatch",

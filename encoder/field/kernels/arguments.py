@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+# The gradients of a ray: of its origin (3), direction (3), time and colour (3).
+RAY_GRADIENTS = 10
+
 
 class PlaneSet(NamedTuple):
     """The planes of a field, and its motion grid."""
@@ -47,6 +50,8 @@ class Gradients(NamedTuple):
     basis: np.ndarray  # (N, 3, F) float32, of each ray; (workers, 3, F) where all rays share one basis
     motion: np.ndarray  # (workers, T, Nz, Ny, Nx, 3) float32
     wants_motion: bool  # whether the gradient of the motion grid is computed, which takes a fifth of the time
+    rays: np.ndarray  # (N, RAY_GRADIENTS) float32, of each ray; (1, RAY_GRADIENTS) where they are not wanted
+    wants_rays: bool  # whether the gradients of rays are computed
 
 
 class SampleArrays(NamedTuple):
@@ -74,6 +79,6 @@ class RayBuffers(NamedTuple):
     g_weights: np.ndarray  # (K,) float32, gradient of the distortion loss with respect to the weights
     g_features: np.ndarray  # (F,) float32, of the current sample
     g_values: np.ndarray  # (6 * M,) float32, of the current sample and scale
-    slopes: np.ndarray  # (3 * M,) float32, gradient with respect to u, by axis and channel
-    g_point: np.ndarray  # (3,) float32, gradient with respect to u
+    slopes: np.ndarray  # (4 * M,) float32, gradient with respect to u and time, by axis and channel
+    g_point: np.ndarray  # (4,) float32, gradient with respect to u and time
     ones: np.ndarray  # (M,) float32

@@ -5,9 +5,9 @@ from numba import prange
 
 from kpc.encoder.field.kernels.arguments import Gradients
 from kpc.encoder.field.kernels.compilation import bare, inlined, parallel
-from kpc.encoder.field.kernels.geometry import cell_index
+from kpc.encoder.field.kernels.geometry import add_ray_gradient, cell_index, inverse_edges, ray_distance
 from kpc.encoder.field.kernels.marching import LIMIT, NEGLIGIBLE, march_ray, new_ray_buffers, shade_ray
-from kpc.encoder.field.kernels.planes import scatter_motion, scatter_planes
+from kpc.encoder.field.kernels.planes import point_gradient, scatter_motion, scatter_planes, undisplace_gradient
 
 
 @bare
@@ -48,23 +48,31 @@ def decoder_gradient(density, basis, g_log, weight, g_rgb, feature, colour, g_fe
 
 
 @bare
-def backpropagate_ray(planes, density, basis, buffers, count, trans, g_rgb, g_background, gradients, peaks):
+def backpropagate_ray(
+    planes, density, volume, origin, direction, basis, buffers, count, trans, g_rgb, g_background, gradients, peaks
+):
     """Add the gradients of one ray after `march_ray` and `shade_ray`, from its last sample to its first.
 
+    Its parameters are those of a ray one by one, since kernels take no nested tuples.
+
     Args:
-        planes, density, buffers: as of `march_ray`. basis: (3, F).
+        planes, density, volume, origin, direction, buffers: as of `march_ray`. basis: (3, F).
         count, trans: what `march_ray` returned.
         g_rgb: d loss / d C, three numbers.
         g_background: trans * g_rgb . background.
-        gradients: `Gradients` of this worker and ray: (n,), (F + 1,), (3, F), (T, Nz, Ny, Nx, 3).
+        gradients: `Gradients` of this worker and ray: (n,), (F + 1,), (3, F), (T, Nz, Ny, Nx, 3), (RAY_GRADIENTS,).
         peaks: (Nz, Ny, Nx), raised to the weights of the samples in each cell.
     """
+    inverse = inverse_edges(volume.aabb)
+    if gradients.wants_rays:
+        gradients.rays[7], gradients.rays[8], gradients.rays[9] = g_rgb
     behind = g_background  # d loss / d C times the colour that comes from behind sample k
     trans_after = trans  # transmittance after sample k
     for k in range(count - 1, -1, -1):
         weight, colour = buffers.weights[k], buffers.colours[k]
         g_weight = g_rgb[0] * colour[0] + g_rgb[1] * colour[1] + g_rgb[2] * colour[2] + buffers.g_weights[k]
-        g_log = (trans_after * g_weight - behind) * buffers.taus[k]
+        g_log_tau = (trans_after * g_weight - behind) * buffers.taus[k]
+        g_log = g_log_tau
         if buffers.log_densities[k] >= LIMIT or buffers.log_densities[k] <= -LIMIT:
             g_log = np.float32(0.0)
         cell = cell_index(peaks, buffers.points[k, 4], buffers.points[k, 5], buffers.points[k, 6])
@@ -83,9 +91,26 @@ def backpropagate_ray(planes, density, basis, buffers, count, trans, g_rgb, g_ba
             gradients.density,
             gradients.basis,
         )
-        scatter_planes(planes, gradients.theta, buffers.g_features, buffers, k, gradients.wants_motion)
+        wants_ray = gradients.wants_rays and weight > NEGLIGIBLE  # as for colours: others hardly move a picture
+        wants_point = wants_ray or gradients.wants_motion
+        scatter_planes(planes, gradients.theta, buffers.g_features, buffers, k, wants_point, wants_ray)
+        if wants_point:
+            point_gradient(buffers, k)
         if gradients.wants_motion:
             scatter_motion(gradients.motion, buffers, k)
+        if wants_ray:
+            undisplace_gradient(planes.motion, buffers, k)
+            add_ray_gradient(
+                origin,
+                direction,
+                ray_distance(buffers.s[k], volume.uniform_distance),
+                volume.aabb,
+                inverse,
+                volume.uniform_distance,
+                buffers.g_point,
+                g_log_tau,
+                gradients.rays,
+            )
 
 
 @parallel
@@ -98,7 +123,8 @@ def backpropagate(planes, density, volume, rays, basis, targets, distortion, gra
     d D / d w_k = 2 sum_j w_j |s_k - s_j| + 2/3 w_k d
     d C / d tau_k = trans_{k+1} c_k - sum_{j>k} w_j c_j - trans_end * background,   tau = sigma * scale * step / extent
 
-    D is the distortion loss of mip-NeRF 360 (arXiv:2111.12077, eq. 15).
+    D is the distortion loss of mip-NeRF 360 (arXiv:2111.12077, eq. 15). The gradient of a ray is that of its samples'
+    points and times, which stay where they are along the ray; that of its direction is without the basis.
 
     Args:
         planes: `PlaneSet`.
@@ -143,6 +169,22 @@ def backpropagate(planes, density, volume, rays, basis, targets, distortion, gra
                 gradients.basis[worker] if shared else gradients.basis[i],
                 gradients.motion[worker],
                 gradients.wants_motion,
+                gradients.rays[i if gradients.wants_rays else 0],
+                gradients.wants_rays,
             )
-            backpropagate_ray(planes, density, b, buffers, count, trans, g_rgb, g_background, own, peaks[worker])
+            backpropagate_ray(
+                planes,
+                density,
+                volume,
+                rays.origins[i],
+                rays.directions[i],
+                b,
+                buffers,
+                count,
+                trans,
+                g_rgb,
+                g_background,
+                own,
+                peaks[worker],
+            )
     return errors, counts

@@ -133,6 +133,66 @@ def displace(motion, u, v, w, time):
 
 
 @inlined
+def add_displacement_slopes(motion, u, v, w, time, g):
+    """Add to g (4,), the gradient of displaced u and of time, what the displacement at u and time contributes."""
+    if motion.shape[0] == 0:
+        return
+    rows, nz, ny, nx, _ = motion.shape
+    t, z, y, x, ft, fz, fy, fx = motion_cell(motion, u, v, w, time)
+    g0, g1, g2 = g[0], g[1], g[2]
+    one = np.float32(1.0)
+    for i in range(16):
+        dt, dz, dy, dx, _ = motion_corner(i, ft, fz, fy, fx)
+        offset = motion[t + dt, z + dz, y + dy, x + dx]
+        along = offset[0] * g0 + offset[1] * g1 + offset[2] * g2
+        wt, wz, wy, wx = ft if dt else one - ft, fz if dz else one - fz, fy if dy else one - fy, fx if dx else one - fx
+        g[0] += along * wt * wz * wy * np.float32((2 * dx - 1) * (nx - 1))
+        g[1] += along * wt * wz * wx * np.float32((2 * dy - 1) * (ny - 1))
+        g[2] += along * wt * wy * wx * np.float32((2 * dz - 1) * (nz - 1))
+        g[3] += along * wz * wy * wx * np.float32((2 * dt - 1) * (rows - 1))
+
+
+@inlined
+def add_ray_gradient(origin, direction, t, aabb, inverse, uniform_distance, g, g_log_scale, out):
+    """Add the gradient of a ray by one of its points, at a distance t that is held fixed: the transpose of `ray_point`.
+
+    Args:
+        origin, direction, t, aabb, inverse, uniform_distance: as of `ray_point`.
+        g: (4,), that of u and time.
+        g_log_scale: that of the logarithm of `density_scale`.
+        out: (7,) or more, of origin, direction and time, added to.
+    """
+    gx, gy, gz = g[0], g[1], g[2]
+    one = np.float32(1.0)
+    if uniform_distance != 0:
+        two = np.float32(2.0)
+        x = two * ((origin[0] + t * direction[0] - aabb[0, 0]) * inverse[0]) - one
+        y = two * ((origin[1] + t * direction[1] - aabb[0, 1]) * inverse[1]) - one
+        z = two * ((origin[2] + t * direction[2] - aabb[0, 2]) * inverse[2]) - one
+        radius = max(max(abs(x), abs(y), abs(z)), one)
+        scale = np.float32(0.25) * (two - one / radius) / radius
+        by_radius = np.float32(0.0)
+        if radius > one:  # d scale / d radius, and density_scale goes as radius^-2
+            slope = np.float32(0.5) * (one / radius - one) / (radius * radius)
+            by_radius = slope * (gx * x + gy * y + gz * z) - two * g_log_scale / radius
+        gx, gy, gz = two * gx * scale, two * gy * scale, two * gz * scale
+        if abs(x) == radius:
+            gx += np.float32(2.0) * (by_radius if x > 0 else -by_radius)
+        elif abs(y) == radius:
+            gy += np.float32(2.0) * (by_radius if y > 0 else -by_radius)
+        elif abs(z) == radius:
+            gz += np.float32(2.0) * (by_radius if z > 0 else -by_radius)
+    gx, gy, gz = gx * inverse[0], gy * inverse[1], gz * inverse[2]
+    out[0] += gx
+    out[1] += gy
+    out[2] += gz
+    out[3] += t * gx
+    out[4] += t * gy
+    out[5] += t * gz
+    out[6] += g[3]
+
+
+@inlined
 def scatter_displacement(g_motion, u, v, w, time, g):
     """Add the gradient of the motion grid, given g (3,), that of the displaced u: the transpose of `displace`."""
     t, z, y, x, ft, fz, fy, fx = motion_cell(g_motion, u, v, w, time)

@@ -47,8 +47,8 @@ def new_ray_buffers(table, M, capacity):
         np.empty(capacity, np.float32),
         np.empty(S * M, np.float32),
         np.empty(6 * M, np.float32),
-        np.empty(3 * M, np.float32),
-        np.empty(3, np.float32),
+        np.empty(4 * M, np.float32),
+        np.empty(4, np.float32),
         np.ones(M, np.float32),
     )
 

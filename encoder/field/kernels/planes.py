@@ -3,7 +3,12 @@
 import numpy as np
 
 from kpc.encoder.field.kernels.compilation import inlined
-from kpc.encoder.field.kernels.geometry import displace, scatter_displacement, texel_and_fraction
+from kpc.encoder.field.kernels.geometry import (
+    add_displacement_slopes,
+    displace,
+    scatter_displacement,
+    texel_and_fraction,
+)
 
 # The axes of the planes xy xz yz xt yt zt along their columns and rows, as positions in "xyzt".
 COLUMN_AXIS, ROW_AXIS = (0, 0, 1, 0, 1, 2), (1, 2, 2, 3, 3, 3)
@@ -131,14 +136,14 @@ def add_slopes(low, high, fc, fr, per_column, per_row, g, along, across):
 
 
 @inlined
-def add_plane_slopes(planes, s, c, corner, fc, fr, g, slopes):
-    """Add the gradient with respect to u by way of plane c of scale s."""
+def add_plane_slopes(planes, s, c, corner, fc, fr, g, slopes, wants_time):
+    """Add the gradient with respect to u, and to time if wanted, by way of plane c of scale s."""
     theta, M = planes.theta, planes.channels
     columns, rows = planes.resolution[s, COLUMN_AXIS[c]], planes.resolution[s, ROW_AXIS[c]]
     low, high = theta[corner : corner + 2 * M], theta[corner + columns * M : corner + (columns + 2) * M]
     along = slopes[COLUMN_AXIS[c] * M : (COLUMN_AXIS[c] + 1) * M]
     per_column = np.float32(columns - 1)
-    if c < 3:
+    if c < 3 or wants_time:
         across = slopes[ROW_AXIS[c] * M : (ROW_AXIS[c] + 1) * M]
         add_slopes(low, high, fc, fr, per_column, np.float32(rows - 1), g, along, across)
     else:
@@ -146,10 +151,10 @@ def add_plane_slopes(planes, s, c, corner, fc, fr, g, slopes):
 
 
 @inlined
-def scatter_planes(planes, g_theta, g_features, buffers, k, wants_slopes):
+def scatter_planes(planes, g_theta, g_features, buffers, k, wants_slopes, wants_time):
     """Add d loss / d theta of sample k, given g_features (F,) = d loss / d features.
 
-    buffers.slopes[axis M :][:M], if wanted, is set to d loss / d u along that axis by channel.
+    buffers.slopes[axis M :][:M], if wanted, is set to d loss / d u along that axis by channel; axis 3 is time.
     """
     if wants_slopes:
         buffers.slopes[:] = np.float32(0.0)
@@ -165,19 +170,32 @@ def scatter_planes(planes, g_theta, g_features, buffers, k, wants_slopes):
             g = g_values[c * M : (c + 1) * M]
             scatter_texels(low, high, w00, w01, w10, w11, g)
             if wants_slopes:
-                add_plane_slopes(planes, s, c, corner, fc, fr, g, buffers.slopes)
+                add_plane_slopes(planes, s, c, corner, fc, fr, g, buffers.slopes, wants_time)
+
+
+@inlined
+def point_gradient(buffers, k):
+    """Set buffers.g_point to the gradient with respect to displaced u and time of sample k, given its slopes."""
+    point, ones, g_point = buffers.points[k], buffers.ones, buffers.g_point
+    M = ones.size
+    for axis in range(4):
+        clamped = point[axis] < np.float32(0.0) or point[axis] > np.float32(1.0)
+        slope = dot(buffers.slopes[axis * M : (axis + 1) * M], ones, M)
+        g_point[axis] = np.float32(0.0) if clamped else slope
 
 
 @inlined
 def scatter_motion(g_motion, buffers, k):
-    """Add the gradient of the motion grid by sample k, given its slopes."""
-    point, ones, g_point = buffers.points[k], buffers.ones, buffers.g_point
-    M = ones.size
-    for axis in range(3):
-        clamped = point[axis] < np.float32(0.0) or point[axis] > np.float32(1.0)
-        slope = dot(buffers.slopes[axis * M : (axis + 1) * M], ones, M)
-        g_point[axis] = np.float32(0.0) if clamped else slope
-    scatter_displacement(g_motion, point[4], point[5], point[6], point[3], g_point)
+    """Add the gradient of the motion grid by sample k, given `point_gradient`."""
+    point = buffers.points[k]
+    scatter_displacement(g_motion, point[4], point[5], point[6], point[3], buffers.g_point)
+
+
+@inlined
+def undisplace_gradient(motion, buffers, k):
+    """Turn the gradient with respect to displaced u and time of sample k into that with respect to u and time."""
+    point = buffers.points[k]
+    add_displacement_slopes(motion, point[4], point[5], point[6], point[3], buffers.g_point)
 
 
 @inlined

@@ -5,7 +5,14 @@ from numba import prange
 
 from kpc.encoder.field.kernels.compilation import parallel
 from kpc.encoder.field.kernels.marching import decode_density, new_ray_buffers
-from kpc.encoder.field.kernels.planes import combine_planes, sample_displaced, scatter_motion, scatter_planes
+from kpc.encoder.field.kernels.planes import (
+    combine_planes,
+    point_gradient,
+    sample_displaced,
+    scatter_motion,
+    scatter_planes,
+    undisplace_gradient,
+)
 
 
 @parallel
@@ -36,20 +43,26 @@ def features(planes, points, times, workers):
 
 
 @parallel
-def scatter_features(planes, g_theta, g_motion, points, times, g):
-    """Add the gradients of planes and motion grid, given g (N, F) = d loss / d `features`.
+def scatter_features(planes, g_theta, g_motion, g_points, points, times, g):
+    """Add the gradients of planes and motion grid, given g (N, F) = d loss / d `features`; set those of points.
 
     The planes are sampled once more rather than kept from the forward pass: all samples would not fit the cache.
 
     Args:
         g_theta: (workers, n) float32, a buffer for each worker.
         g_motion: (workers, T, Nz, Ny, Nx, 3) float32, the same of the motion grid.
+        g_points: (N, 4) float32, of points and times; (0, 4) where they are not wanted.
     """
-    N, workers, wants_motion = points.shape[0], g_theta.shape[0], g_motion.size > 0
+    N, workers, wants_motion, wants_points = points.shape[0], g_theta.shape[0], g_motion.size > 0, g_points.size > 0
     for worker in prange(workers):
         buffers = new_ray_buffers(planes.table, planes.channels, 1)
         for i in range(worker * N // workers, (worker + 1) * N // workers):
             sample_displaced(planes, points[i, 0], points[i, 1], points[i, 2], times[i], buffers, 0)
-            scatter_planes(planes, g_theta[worker], g[i], buffers, 0, wants_motion)
+            scatter_planes(planes, g_theta[worker], g[i], buffers, 0, wants_motion or wants_points, wants_points)
+            if wants_motion or wants_points:
+                point_gradient(buffers, 0)
             if wants_motion:
                 scatter_motion(g_motion[worker], buffers, 0)
+            if wants_points:
+                undisplace_gradient(planes.motion, buffers, 0)
+                g_points[i] = buffers.g_point
