@@ -133,6 +133,7 @@ def test_a_carried_camera_is_placed(walk, kind, tmp_path, capsys):
     assert [frame["file_path"] for frame in frames] == [f"cam{number:02d}.png" for number in range(5)]
     centres, angle = aligned(np.array([frame["transform_matrix"] for frame in frames]), poses)
     assert centres < 0.01 and angle < 0.2
+    assert all(("far" in frame) == (kind == "moving camera") for frame in frames)
     times = [frame.get("time") for frame in frames]
     assert times == (pytest.approx(np.linspace(0, 1, 5)) if kind == "moving camera" else [None] * 5)
 
