@@ -7,6 +7,7 @@ The coarsest picture of the first seconds comes first, then finer scales, then l
 import os
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -17,7 +18,7 @@ from kpc.encoder.coding.raw_planes import encode_raw_segment
 from kpc.encoder.coding.segments import choose_codec
 from kpc.encoder.coding.weights import encode_weights
 from kpc.format.coding.poses import encode_poses
-from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels
+from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels, to_half
 from kpc.format.common.errors import FormatError
 from kpc.format.container.container import Chunk, Codec, pack
 from kpc.format.container.metadata_chunk import pack_metadata
@@ -43,7 +44,7 @@ from kpc.format.container.segments import rows_per_segment, side_info_at
 from kpc.format.container.sound_chunk import pack_sound
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import QuantisedMotion
-from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder, Scene
+from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, AnyDecoder, Appearance, HybridDecoder, Scene
 from kpc.format.scene.sound import SAMPLE_RATE
 
 
@@ -120,7 +121,8 @@ def fixed_bytes(scene: Scene | QuantisedScene, *, with_occupancy: bool) -> int:
     """
     chunks = [_occupancy_chunk(scene.occupancy)] if with_occupancy else []
     sound = [] if scene.sound is None else pack_sound(scene.sound)
-    return len(pack(chunks + _chunks_about(scene) + sound, 0))
+    rounded = tuple(Appearance(one.name, to_half(one.code, "appearances")) for one in scene.appearances)
+    return len(pack(chunks + _chunks_about(replace(scene, appearances=rounded)) + sound, 0))
 
 
 def _check_planes(scene: QuantisedScene, head: SceneHead) -> None:
