@@ -14,6 +14,7 @@ from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
 from kpc.player.cpu.reference import Rendering
 from kpc.player.quality import LEVELS
+from kpc.tools.rendering.bands import in_bands
 from kpc.tools.rendering.clean_plate import CleanPlates, matte, motion_colours
 
 # Renders a camera's picture at a time in [0, 1] over the clip.
@@ -66,9 +67,10 @@ def _what_moves(scene: Scene, picture: Rendering, share: np.ndarray, content: st
 
 def _gl_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
     from kpc.player.gl import offscreen  # here, since the reference backend works without moderngl
-    from kpc.player.gl.renderer import Renderer
+    from kpc.player.gl.renderer import Renderer, is_software
 
     ctx = offscreen.open_context()
+    is_slow = is_software(ctx) and not LEVELS[options.quality].folded  # pixels of other levels depend on others
     renderers: list[Renderer] = []
 
     def draw(scene: Scene, camera: Camera, time: float, needed: Sequence[Scene]) -> Rendering:
@@ -79,7 +81,11 @@ def _gl_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
         if renderer is None:
             renderers.append(renderer := Renderer(ctx, scene, LEVELS[options.quality]))
         appearance = appearance_of(scene, options.appearance)
-        return renderer.render(camera, time, part=options.part, appearance=appearance)
+
+        def drawn(camera: Camera) -> Rendering:
+            return renderer.render(camera, time, part=options.part, appearance=appearance)
+
+        return in_bands(drawn, camera) if is_slow else drawn(camera)
 
     return draw, offscreen.describe(ctx)
 
@@ -87,7 +93,9 @@ def _gl_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
 def _reference_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
     def draw(scene: Scene, camera: Camera, time: float, needed: Sequence[Scene]) -> Rendering:
         appearance = appearance_of(scene, options.appearance)
-        return reference.render(scene, camera, time, part=options.part, appearance=appearance)
+        return in_bands(
+            lambda band: reference.render(scene, band, time, part=options.part, appearance=appearance), camera
+        )
 
     return draw, "reference renderer (numpy)"
 
