@@ -12,8 +12,8 @@ from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.poses.footage import Footage, find_footage
 from kpc.encoder.poses.given_clocks import read_clocks
 from kpc.encoder.poses.instants import Picture, grey_of, moving_pictures, still_pictures
-from kpc.encoder.poses.orientation import extent, oriented
-from kpc.encoder.poses.structure import MANY, Pairing, PlacedView, Structure, reconstruct
+from kpc.encoder.poses.orientation import extent
+from kpc.encoder.poses.structure import MANY, Pairing, PlacedView, Structure, oriented, reconstruct
 from kpc.encoder.poses.survey import Survey, frame_count, greys, survey
 from kpc.encoder.poses.sync import UNKNOWN, Clock, synchronise
 from kpc.encoder.poses.wishes import Wishes
@@ -96,8 +96,8 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
 
 def _is_numbered(footage: Sequence[Footage]) -> bool:
     """Return whether images are numbered without gaps."""
-    numbers = [re.search(r"\d+(?=\D*$)", one.name) for one in footage]
-    return all(numbers) and len(footage) == 1 + int(numbers[-1][0]) - int(numbers[0][0])
+    numbers = [int(found[0]) for one in footage if (found := re.search(r"\d+(?=\D*$)", one.name))]
+    return len(numbers) == len(footage) == 1 + numbers[-1] - numbers[0]
 
 
 def _what(footage: Sequence[Footage], surveys: Sequence[Survey], is_still: bool, rig: str) -> str:

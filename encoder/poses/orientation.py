@@ -1,10 +1,6 @@
-"""The world that found cameras are put into: z up, its origin where they look, and a size."""
-
-from dataclasses import replace
+"""What cameras say of the world: what is up, where they look, and how far apart they are."""
 
 import numpy as np
-
-from kpc.encoder.poses.structure import Structure
 
 # The cameras' horizontal axes give the vertical one if they spread by as much as this, as a ratio of singular values.
 SPREAD = 0.08
@@ -42,29 +38,3 @@ def extent(poses: np.ndarray) -> float:
     """Return the largest distance between two cameras."""
     centres = poses[:, :3, 3]
     return float(np.linalg.norm(centres[:, None] - centres, axis=2).max())
-
-
-def oriented(structure: Structure, scale: float) -> Structure:
-    """Return the structure turned to z up, with its origin where the cameras look, `scale` times as large."""
-    poses = np.stack([view.camera_to_world for view in structure.views.values()])
-    up = up_direction(poses)
-    forward = -poses[:, :3, 2].mean(0)
-    y = forward - (forward @ up) * up
-    if np.linalg.norm(y) < 1e-6:
-        y = np.linalg.svd(up[None])[2][1]
-    y /= np.linalg.norm(y)
-    turn = np.stack([np.cross(y, up), y, up])  # rows: the new x, y and z axes
-    origin = looked_at(poses)
-    moved = {number: _moved(view.camera_to_world, turn, origin, scale) for number, view in structure.views.items()}
-    return replace(
-        structure,
-        views={number: replace(view, camera_to_world=moved[number]) for number, view in structure.views.items()},
-        points=scale * (structure.points - origin) @ turn.T,
-    )
-
-
-def _moved(pose: np.ndarray, turn: np.ndarray, origin: np.ndarray, scale: float) -> np.ndarray:
-    moved = np.eye(4)
-    moved[:3, :3] = turn @ pose[:3, :3]
-    moved[:3, 3] = scale * turn @ (pose[:3, 3] - origin)
-    return moved

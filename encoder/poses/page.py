@@ -22,7 +22,7 @@ def write_page(found: Found, title: str, file: Path) -> None:
     with_picture = set() if found.kind == "moving camera" else set(spread(len(names), PICTURES))
     cameras = []
     for number, name in enumerate(names):
-        view, facts = views.get(number), ()
+        view, facts = views.get(number), tuple[str, ...]()
         if is_rig:
             clock = found.clocks[number]
             confidence = "" if math.isnan(clock.confidence) else f"{clock.confidence:.0%}"

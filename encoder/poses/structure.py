@@ -6,13 +6,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from kpc.encoder.datasets.capture import opengl_pose
 from kpc.encoder.poses.instants import Picture
+from kpc.encoder.poses.orientation import looked_at, up_direction
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.progress import Progress
 
@@ -228,3 +229,29 @@ def _read(folder: Path) -> Structure:
         arrays["observations"] if "observations" in arrays else np.zeros((0, 4)),
         {(one, two): (matches, agreeing) for one, two, matches, agreeing in found["pairs"]},
     )
+
+
+def oriented(structure: Structure, scale: float) -> Structure:
+    """Return the structure turned to z up, with its origin where the cameras look, `scale` times as large."""
+    poses = np.stack([view.camera_to_world for view in structure.views.values()])
+    up = up_direction(poses)
+    forward = -poses[:, :3, 2].mean(0)
+    y = forward - (forward @ up) * up
+    if np.linalg.norm(y) < 1e-6:
+        y = np.linalg.svd(up[None])[2][1]
+    y /= np.linalg.norm(y)
+    turn = np.stack([np.cross(y, up), y, up])  # rows: the new x, y and z axes
+    origin = looked_at(poses)
+    moved = {number: _moved(view.camera_to_world, turn, origin, scale) for number, view in structure.views.items()}
+    return replace(
+        structure,
+        views={number: replace(view, camera_to_world=moved[number]) for number, view in structure.views.items()},
+        points=scale * (structure.points - origin) @ turn.T,
+    )
+
+
+def _moved(pose: np.ndarray, turn: np.ndarray, origin: np.ndarray, scale: float) -> np.ndarray:
+    moved = np.eye(4)
+    moved[:3, :3] = turn @ pose[:3, :3]
+    moved[:3, 3] = scale * turn @ (pose[:3, 3] - origin)
+    return moved

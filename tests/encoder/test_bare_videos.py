@@ -173,6 +173,7 @@ def test_cameras_are_found_anew_if_what_they_depend_on_changes(tmp_path, monkeyp
     monkeypatch.setattr("kpc.encoder.poses.find.find_poses", lambda *_: None)
     monkeypatch.setattr("kpc.encoder.poses.document.write_document", lambda _, __, file: file.write_text("{}"))
     monkeypatch.setattr("kpc.encoder.cli.kpposes.report", lambda _: "")
+    monkeypatch.setattr("kpc.encoder.poses.page.write_page", lambda *_: None)
     monkeypatch.setattr(read_dataset, "load_dataset", stop)
     sync = ("--sync", str(offsets))
     assert "has no poses; finding the cameras" in said(*sync)
