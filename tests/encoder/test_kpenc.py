@@ -775,8 +775,9 @@ def test_rate_distortion_targets(run: Kpenc, sets: Path, tmp_path: Path) -> None
         sizes.append(json.loads(out)["size_bytes"])
     assert sizes[0] > usual > sizes[1] and sizes[2] <= target
     last = (tmp_path / "out.kpc").read_bytes()
-    code, out, err = run(sets / "n3dv", "--resume", "--target-size", "0.5KB")
-    assert code == 1 and out == "" and "is the smallest size of this model" in err.splitlines()[-1]
+    for size, reason in ("0.5KB", "what no quantisation step shrinks"), ("1KB", "is the smallest size of this model"):
+        code, out, err = run(sets / "n3dv", "--resume", "--keep", "--target-size", size)
+        assert code == 1 and out == "" and reason in err.splitlines()[-1]
     assert (tmp_path / "out.kpc").read_bytes() == last
     assert run(sets / "n3dv", "--resume")[0] == 0 and {p.name for p in tmp_path.iterdir()} == {"out.kpc"}
 

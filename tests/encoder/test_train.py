@@ -131,13 +131,13 @@ def test_rays_follow_temporal_weights_from_the_configured_share_on(
     rig: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, seen = trainer(rig, steps=40, temporal_start=0.6), []
-    draw = RaySampler.draw
+    draw = RaySampler.draw_pixels
 
     def recorded(sampler: RaySampler, *args: object) -> object:
         seen.append((run.step, args[-1]))
         return draw(sampler, *args)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(RaySampler, "draw", recorded)
+    monkeypatch.setattr(RaySampler, "draw_pixels", recorded)
     run.run(ignore)
     assert [step for step, weights in seen if weights is not None] == list(range(24, 40))
     assert len({id(weights) for _, weights in seen}) == 2  # computed once

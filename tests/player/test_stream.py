@@ -241,7 +241,7 @@ def test_a_stalled_player_continues(watched: Callable[..., Stream], tmp_path: Pa
     with serving(tmp_path, handler=Halting) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
-        assert (stream.message or "").startswith("loading, ")
+        assert (stream.message or "").startswith("loading")
         until(lambda: stream.can_show(0.0), stream, renderer)
         assert stream.message is None
         time = 0.0
@@ -249,7 +249,7 @@ def test_a_stalled_player_continues(watched: Callable[..., Stream], tmp_path: Pa
             stream.set_playhead(Playhead(time, 0.1))
             time += 0.01
             assert time < 1
-        assert (stream.message or "").startswith("loading, ")
+        assert (stream.message or "").startswith("loading")
         release.set()
         until(lambda: stream.can_show(time, 0.1), stream, renderer)
         assert stream.message is None
