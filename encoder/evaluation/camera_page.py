@@ -17,7 +17,7 @@ from kpc.encoder.datasets.dataset import Dataset
 from kpc.encoder.poses.orientation import looked_at, up_direction
 from kpc.format.common.cli import atomic_write
 
-# Of more cameras than these, some are labelled, have a picture, or are drawn.
+# At most so many cameras are labelled, have a picture, or are drawn; where there are more, some of them.
 LABELS, PICTURES, DRAWN, POINTS = 24, 24, 400, 2500
 # Sides of the drawings and widths of the pictures, in pixels; cameras are drawn by this share of a side.
 SIDE, WIDTH, CAMERA = 440, 200, 0.05

@@ -12,6 +12,7 @@ import numpy as np
 from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.datasets.dataset import Dataset
 from kpc.encoder.field.bounds import visible_cells
+from kpc.format.common.images import luma
 from kpc.format.scene.space import SpaceMapping
 
 # Cells along each side of the box in which it is counted how many cameras see them.
@@ -22,14 +23,12 @@ PICTURES, ROWS = 96, 32
 # Neighbouring cameras further apart than this, as seen from what they look at, leave gaps in between; cameras that are
 # all within the other angle see too little of depth. Both in degrees.
 SPARSE, NARROW = 30.0, 1.5
-# Of the cells that one camera sees, at least this share must be seen by a second one.
+# A second camera must see at least this share of the cells that one camera sees.
 SHARED = 0.25
 # Neighbouring cameras of a rig whose exposures differ by more than so many stops show in novel views.
 STOPS = 0.6
 # Pictures with less than this share of the others' fine detail are blurred; so many of a moving camera's may be.
 BLURRED, BLURRED_SHARE = 0.6, 0.2
-
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 @dataclass(frozen=True)
@@ -184,11 +183,11 @@ def _light_and_detail(dataset: Dataset, train: np.ndarray, shown: np.ndarray) ->
         tops = np.linspace(0, int(pictures.height[n]) - 1, ROWS).astype(int).tolist()
         rows = np.concatenate([dataset.pixels.picture(n, top, top + 1) for top in sorted(set(tops))]).astype(np.float32)
         opaque = rows[..., 3] > 0 if dataset.has_alpha else np.ones(rows.shape[:2], bool)
-        luma = rows[..., :3] @ LUMA
-        fine, coarse = ((luma[:, step:] - luma[:, :-step])[opaque[:, step:] & opaque[:, :-step]] for step in (1, 4))
+        grey = luma(rows)
+        fine, coarse = ((grey[:, step:] - grey[:, :-step])[opaque[:, step:] & opaque[:, :-step]] for step in (1, 4))
         camera = order[int(pictures.camera[n])]
         if opaque.any():
-            light[camera].append(float(np.log2(luma[opaque].mean() + 1)))
+            light[camera].append(float(np.log2(grey[opaque].mean() + 1)))
         if len(coarse) and (power := float((coarse**2).mean())) > 1:
             detail[camera].append(float(np.sqrt((fine**2).mean() / power)))
     return _medians(light), _medians(detail)

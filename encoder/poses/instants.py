@@ -7,9 +7,9 @@ import numpy as np
 
 from kpc.encoder.datasets.video import read_video
 from kpc.encoder.poses.footage import Footage
-from kpc.encoder.poses.survey import Survey, luma
+from kpc.encoder.poses.survey import Survey
 from kpc.encoder.poses.sync import Clock
-from kpc.format.common.images import read_image
+from kpc.format.common.images import luma, read_image
 
 # Frames of two cameras show the same instant if they are no further apart than this share of a frame.
 SAME_INSTANT = 0.3

@@ -7,7 +7,7 @@ import numpy as np
 
 from kpc.encoder.datasets.video import read_video
 from kpc.encoder.poses.footage import Footage
-from kpc.format.common.images import read_image
+from kpc.format.common.images import luma, read_image
 
 # Frames, spread over the clip, from which the median picture is made.
 SPREAD_FRAMES = 15
@@ -20,8 +20,6 @@ TEXTURE, STAYS = 12.0, 8.0
 STILL_SHARE = 0.5
 # A pixel moves if it leaves its median by more than so many levels, and so many times its usual deviation.
 MOVES, MOVES_BY_NOISE = 10.0, 6.0
-
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 @dataclass(frozen=True)
@@ -54,12 +52,6 @@ def greys(footage: Footage) -> Iterator[np.ndarray]:
         else (read_image(file, upright=True) for file in footage.files)
     )
     yield from map(luma, frames)
-
-
-def luma(picture: np.ndarray) -> np.ndarray:
-    """Return the luma of a picture, (H, W) float32 in [0, 255]."""
-    found: np.ndarray = picture[..., :3].astype(np.float32) @ LUMA
-    return found
 
 
 def frame_count(footage: Footage) -> int:

@@ -157,6 +157,16 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * np.power(clipped, 1 / 2.4) - 0.055)
 
 
+# Weights of red, green and blue in luma (ITU-R BT.601).
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+
+
+def luma(picture: np.ndarray) -> np.ndarray:
+    """Return the luma of a picture, (H, W) float32 in [0, 255]."""
+    found: np.ndarray = picture[..., :3].astype(np.float32) @ LUMA
+    return found
+
+
 def linear_from_srgb(display: np.ndarray) -> np.ndarray:
     """Apply the inverse of the curve of `srgb_from_linear` to values in [0, 1]."""
     return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)

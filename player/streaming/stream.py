@@ -372,5 +372,5 @@ class Stream:
 
 
 def loading_message(bytes_per_s: float) -> str:
-    """Return what a user is told who has to wait; no rate where all has arrived and is being decoded."""
+    """Return the message for a user who has to wait; no rate where all has arrived and is being decoded."""
     return f"loading, {bytes_per_s / 1e3:,.0f} KB/s" if bytes_per_s >= 500 else "loading"

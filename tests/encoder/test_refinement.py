@@ -68,7 +68,16 @@ def pictures_of(cameras: list[Camera], frames: int, distortion: tuple[float, ...
 def dataset_of(pictures: Pictures, frames: int = 11) -> Dataset:
     """Return a dataset of pictures without pixels."""
     names = tuple(f"cam{c}" for c in np.unique(pictures.camera))
-    return Dataset("N3DV", Path("rig"), pictures, None, Clip(frames, 10.0), frames > 1, False, names)  # type: ignore[arg-type]
+    return Dataset(
+        "N3DV",
+        Path("rig"),
+        pictures,
+        None,
+        Clip(frames, 10.0),
+        frames > 1,
+        False,
+        names,  # type: ignore[arg-type]
+    )
 
 
 def rig(count: int = 5) -> list[Camera]:

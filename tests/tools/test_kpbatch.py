@@ -20,7 +20,7 @@ from kpc.tools.batch import engine, jobs, simulation, working
 from kpc.tools.batch.addresses import source_address
 from kpc.tools.batch.engine import Engine, Event
 from kpc.tools.batch.jobs import FaultyBatch, Job, Resources
-from kpc.tools.batch.store import RESULT, SCENE, Store, StoreError
+from kpc.tools.batch.store import RESULT, SCENE, WORK, Store, StoreError
 from kpc.tools.batch.tasks import ENCODE, Outcome, Task, done_before, first_tasks, tasks_of_groups
 from kpc.tools.batch.working import Place
 from kpc.tools.cli.kpbatch import main
@@ -132,15 +132,15 @@ def test_an_address_follows_content_options_and_group(take: Path) -> None:
 def test_a_store_holds_whole_files(tmp_path: Path, address: str) -> None:
     store, file = Store(address.format(tmp_path / "store")), tmp_path / "file"
     file.write_bytes(b"content")
-    store.put(file, "key/work/deep/a")
+    store.put(file, f"key/{WORK}/deep/a")
     store.put_json({"a": 1}, "key/result.json")
-    store.copy("key/work/deep/a", "other")
+    store.copy(f"key/{WORK}/deep/a", "other")
     assert store.names("*/result.json") == ["key/result.json"] and store.get_json("key/result.json") == {"a": 1}
-    assert store.get_folder("key/work", tmp_path / "back") and not store.get_folder("none", tmp_path / "none")
+    assert store.get_folder(f"key/{WORK}", tmp_path / "back") and not store.get_folder("none", tmp_path / "none")
     assert (tmp_path / "back/deep/a").read_bytes() == b"content" and store.exists("other")
     with pytest.raises(StoreError, match="no such file"):
         store.put(tmp_path / "missing", "key/b")
-    assert store.names("key/*") == ["key/result.json", "key/work"]
+    assert store.names("key/*") == ["key/result.json", f"key/{WORK}"]
     store.remove("key")
     store.remove("key")
     assert not store.exists("key/result.json")
@@ -291,16 +291,16 @@ def test_changed_files_of_a_work_folder_reach_the_store(tmp_path: Path) -> None:
         (work / name).mkdir(parents=True)
     for name in ("group-0000/checkpoint.kpck", "pixels-1.bin", "pixels-2/0000.bin", ".checkpoint.tmp"):
         (work / name).write_bytes(b"1")
-    uploads = working.Uploads(work, store, "key/work")
+    uploads = working.Uploads(work, store, f"key/{WORK}")
     uploads.run()
-    assert store.names("key/work/*") == ["key/work/group-0000"]
-    assert store.names("key/work/*/*") == ["key/work/group-0000/checkpoint.kpck"]
-    store.remove("key/work/group-0000/checkpoint.kpck")
+    assert store.names(f"key/{WORK}/*") == [f"key/{WORK}/group-0000"]
+    assert store.names(f"key/{WORK}/*/*") == [f"key/{WORK}/group-0000/checkpoint.kpck"]
+    store.remove(f"key/{WORK}/group-0000/checkpoint.kpck")
     uploads.run()
-    assert not store.exists("key/work/group-0000/checkpoint.kpck")
+    assert not store.exists(f"key/{WORK}/group-0000/checkpoint.kpck")
     (work / "group-0000/checkpoint.kpck").write_bytes(b"22")
     uploads.run()
-    assert store.exists("key/work/group-0000/checkpoint.kpck")
+    assert store.exists(f"key/{WORK}/group-0000/checkpoint.kpck")
 
 
 def test_failures_are_listed_and_what_is_done_is_published(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

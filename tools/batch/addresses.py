@@ -29,7 +29,7 @@ def address_of(*parts: Any) -> str:
 
 @cache
 def code_address() -> str:
-    """Return the address of the code of encoder and format, as it is installed."""
+    """Return the address of the installed code of encoder and format."""
     digest = hashlib.sha256()
     for package in CODE:
         root = Path(_folder_of(package))

@@ -96,7 +96,7 @@ def remote_cluster(address: str) -> Iterator[Client]:
 
 
 class Engine:
-    """Runs tasks on a cluster, each after those that it needs, and tells what happens to them.
+    """Runs tasks on a cluster, each after those that it needs, and reports what happens to them.
 
     Args:
         connect: returns the client of a cluster; called when there is something to do.
@@ -248,7 +248,7 @@ class Engine:
 
 
 def _work(runner: Runner, task: Task, place: Place) -> Outcome:
-    """Do a task on a worker, and tell the client how far it has come."""
+    """Do a task on a worker, and report to the client how far it has come."""
     worker = get_worker()
     last: dict[str, float] = {}
 

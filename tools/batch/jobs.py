@@ -158,7 +158,7 @@ def jobs_of_folders(folders: Sequence[str], options: Sequence[str], resources: R
 
 
 def resolve(text: str, folder: Path) -> str:
-    """Return an address as it is, and a path as an absolute one, relative to a folder."""
+    """Return an address unchanged, and a path as an absolute one, relative to a folder."""
     return text if ADDRESS.match(text) else str((folder / text).expanduser().absolute())
 
 

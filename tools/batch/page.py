@@ -41,7 +41,7 @@ class Page:
             print(_line_of(event), file=sys.stderr, flush=True)
 
     def redraw(self) -> None:
-        """Show the page as it is now."""
+        """Show the present state of the page."""
         if not self._is_terminal or self._as_json:
             return
         width, height = shutil.get_terminal_size()

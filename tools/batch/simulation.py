@@ -90,7 +90,7 @@ def simulate(model: Model, seed: int = 0) -> Result:
     # Checkpoints take their share of the link all the time; where it cannot hold them, they become rarer.
     interval = max(model.checkpoint_s, model.workers * model.checkpoint_bytes / (MOST_SHARE * model.link))
     for_scenes = model.link - model.workers * model.checkpoint_bytes / interval
-    link_free = scheduler_free = redone = sent = told = ended = 0.0
+    link_free = scheduler_free = redone = sent = messages_s = ended = 0.0
     failures = 0
     while waiting or back:
         now, worker = heapq.heappop(free)
@@ -101,7 +101,7 @@ def simulate(model: Model, seed: int = 0) -> Result:
             length, done, fails = waiting.pop()
         # The scheduler hands out the scene; the store sends it over its link, one scene after the other.
         scheduler_free = max(scheduler_free, now) + model.messages * model.message_s
-        told += model.messages * model.message_s
+        messages_s += model.messages * model.message_s
         moved = model.input_bytes + (model.checkpoint_bytes if done else 0.0)
         link_free = max(link_free, scheduler_free) + moved / for_scenes
         sent += moved
@@ -109,7 +109,7 @@ def simulate(model: Model, seed: int = 0) -> Result:
         fails_after = rng.exponential(model.failure_s)
         worked = min(left, fails_after)
         kept = worked // interval * interval
-        told += worked / model.report_s * model.message_s
+        messages_s += worked / model.report_s * model.message_s
         finish = begun + worked
         ended = max(ended, finish)
         if fails_after < left:
@@ -121,7 +121,7 @@ def simulate(model: Model, seed: int = 0) -> Result:
             heapq.heappush(back, (finish, (length, 0.0, False)))
         heapq.heappush(free, (finish, worker))
     busy = ended * model.workers
-    return Result(ended, float(lengths.sum()) / busy, redone, failures, sent / for_scenes / ended, told / ended)
+    return Result(ended, float(lengths.sum()) / busy, redone, failures, sent / for_scenes / ended, messages_s / ended)
 
 
 def plot(model: Model, path: Path) -> None:

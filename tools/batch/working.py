@@ -36,7 +36,7 @@ MEANS = ("test_psnr", "test_psnr_moving", "test_psnr_still", "test_ssim")
 SUMS = ("test_pictures", "steps", "train_s", "coding_s", "encode_s")
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
-# What is told of a task that runs: percent done, seconds left, and PSNR, as far as they are known.
+# Takes the progress of a task that runs: percent done, seconds left, and PSNR, as far as they are known.
 Report = Callable[[dict[str, float]], None]
 
 
@@ -97,11 +97,10 @@ def _run_in(folder: Path, task: Task, store: Store, place: Place, report: Report
         resumes = store.get_folder(f"{task.key}/{WORK}", work)
         source = _local_source(task.source, place)
         command = [source, "-o", str(scene), *task.words]
-        if Path(source).is_dir():
-            command.append(f"--work={work}")
+        if Path(source).is_dir():  # a file is coded anew, which needs no work folder
+            command += [f"--work={work}", *["--resume"] * (resumes and task.kind == ENCODE)]
         if task.kind == ENCODE:
-            kept = ["--resume"] * resumes if Path(source).is_dir() else []
-            figures = _child(["kpenc", *command, "--json", *kept], task, folder, store, report)
+            figures = _child(["kpenc", *command, "--json"], task, folder, store, report)
         else:
             figures = _child(["prepare", *command], task, folder, store, report)
             Uploads(work, store, f"{task.key}/{WORK}").run()

@@ -10,7 +10,7 @@ from kpc.player.cpu.reference import SceneAtTime, density, features
 
 # Points at which the field is evaluated at once.
 BLOCK = 1 << 16
-# Is told which share of the work has been done since it was last called.
+# Is called with the share of the work that has been done since the last call.
 Done = Callable[[float], None]
 # Half the distance over which gradients are taken, in edges of the box.
 GRADIENT_REACH = 1.0 / 512

@@ -58,7 +58,7 @@ class CleanPlates:
             if known_scene is scene and _are_equal(known, camera):
                 return plate
         times = INSTANTS if scene.is_dynamic else INSTANTS[:1]
-        # A camera that moves needs a plate for each frame; of those, the bar of the frames tells the time left.
+        # A camera that moves needs a plate for each frame; the bar of the frames shows how much time those take.
         shown = progress(times.tolist(), "clean plate", unit="pictures", shown=not self._plates)
         plate = clean_plate([self._draw(scene, camera, time) for time in shown])
         self._plates = [*self._plates[-1:], (scene, camera, plate)]

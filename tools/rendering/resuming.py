@@ -94,7 +94,7 @@ def _checksum(content: bytes) -> str:
 
 
 def _identity(value: Any) -> Any:
-    """Return what tells one value from another: of files their content, since they may be renamed."""
+    """Return what distinguishes one value from another: of files their content, since they may be renamed."""
     return value[value.index(CHECKSUM) :] if isinstance(value, str) and CHECKSUM in value else value
 
 
