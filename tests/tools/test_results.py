@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from kpc.format.common.errors import FormatError
-from kpc.tools.bench import results, tables
+from kpc.tools.bench import columns, results, tables
 from kpc.tools.bench.records import Record, median
 
 MACHINE = {"cpu": "Test CPU", "cores": 2, "memory_bytes": 8 << 30, "os": "Linux", "python": "3.11"}
@@ -36,9 +36,9 @@ def encode_record(name: str, psnrs: list[float | None], **changes: object) -> Re
 
 def test_printed_tables_fit_a_terminal() -> None:
     """Six columns of each kind of record, within 100 characters for the records that the documents show."""
-    assert tables.PRINTED.keys() == tables.COLUMNS.keys()
-    for kind, names in tables.PRINTED.items():
-        assert len(names) == 6 and {*names} <= {name for name, _ in tables.COLUMNS[kind]}
+    assert columns.PRINTED.keys() == columns.COLUMNS.keys()
+    for kind, names in columns.PRINTED.items():
+        assert len(names) == 6 and {*names} <= {name for name, _ in columns.COLUMNS[kind]}
     for path in sorted((Path(__file__).parents[2] / "docs" / "bench").glob("*.json")):
         records = results.load([path])
         assert max(map(len, tables.printed(records[0]["kind"], records).splitlines())) <= 100
