@@ -1,6 +1,7 @@
 /** A canvas on which scenes of a clip are drawn. */
 
 import type { Camera } from '../container/scene_chunks.js';
+import { contextOf, whenIdle } from '../render/context.js';
 import type { ShownPart } from '../render/picture_job.js';
 import type { Level } from '../render/quality.js';
 import { type Frame, Renderer } from '../render/renderer.js';
@@ -27,14 +28,22 @@ export class Picture {
   readonly #renderer: Renderer;
   readonly #scenes: ClipScenes;
 
+  private constructor(canvas: HTMLCanvasElement, renderer: Renderer) {
+    this.canvas = canvas;
+    this.#renderer = renderer;
+    this.#scenes = new ClipScenes(renderer);
+  }
+
   /**
+   * Make a canvas, and wait for its context without holding up the page.
    * @param size width and height in pixels of the screen; to change it later waits for what the card does then.
    * @throws RenderError: the browser cannot draw.
    */
-  constructor([width, height]: readonly [number, number], options: PictureOptions) {
-    this.canvas = Object.assign(document.createElement('canvas'), { width, height });
-    this.#renderer = new Renderer(this.canvas, options);
-    this.#scenes = new ClipScenes(this.#renderer);
+  static async open([width, height]: readonly [number, number], options: PictureOptions): Promise<Picture> {
+    const canvas = Object.assign(document.createElement('canvas'), { width, height });
+    const gl = contextOf(canvas);
+    await whenIdle(gl);
+    return new Picture(canvas, new Renderer(gl, options));
   }
 
   get isLost(): boolean {
@@ -84,9 +93,9 @@ export class Picture {
     return this.#renderer.drawInto(frames, this.#scenes.moments(clip, time), options).pictures;
   }
 
-  /** Have shaders compiled for that, before there is anything to draw. */
-  prepare(clip: Clip, time: number, camera: Camera, { level, part }: ShownOptions): void {
-    this.#renderer.prepare(camera, this.#scenes.moments(clip, time), { level, part });
+  /** Have shaders compiled for that, before there is anything to draw; return whether all are. */
+  prepare(clip: Clip, time: number, camera: Camera, { level, part }: ShownOptions): boolean {
+    return this.#renderer.prepare(camera, this.#scenes.moments(clip, time), { level, part });
   }
 
   /** Forget a scene that the clip no longer holds. */

@@ -107,7 +107,7 @@ export class Session {
       this.wake();
       await driver;
       if (this.#isClosed) return;
-      this.#picture = new Picture(this.#size, {
+      const picture = await Picture.open(this.#size, {
         fps,
         onLost: () => this.#events.lost(true),
         onRestored: () => {
@@ -115,6 +115,8 @@ export class Session {
           this.wake();
         },
       });
+      if (this.#isClosed) return picture.dispose();
+      this.#picture = picture;
       stage.append(this.#picture.canvas);
       this.wake();
     } catch (error) {
@@ -280,8 +282,8 @@ export class Session {
     const camera = cameraOf(view.view, width, height);
     // Nothing that is worse than the poster, or than the picture before a jump.
     if (!this.#isInSight || !(clip.canShow(time) || (this.isShown && !isSeeking))) {
-      this.#isSharp = !hasTaken;
-      this.#picture.prepare(clip, time, camera, this.#shownOptions());
+      const isPrepared = this.#picture.prepare(clip, time, camera, this.#shownOptions());
+      this.#isSharp = isPrepared && !hasTaken;
       return;
     }
     this.#picture.resize(width, height);

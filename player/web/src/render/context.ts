@@ -10,6 +10,9 @@ const ATTRIBUTES = {
   powerPreference: 'high-performance',
 };
 
+/** Milliseconds between two questions whether the card is idle. */
+const POLL_MS = 4;
+
 /** This browser or card cannot draw a scene; the message says why, for people. */
 export class RenderError extends KpcError {
   override name = 'RenderError';
@@ -28,6 +31,15 @@ export function contextOf(canvas: HTMLCanvasElement | OffscreenCanvas): WebGL2Re
   if (gl === null)
     throw new RenderError('this browser has no WebGL2; update it, or allow it to use the graphics card', 'no-webgl');
   return gl;
+}
+
+/** Resolve once the card has done what a context was given; the page goes on meanwhile. */
+export async function whenIdle(gl: WebGL2RenderingContext): Promise<void> {
+  const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+  gl.flush();
+  while (fence && !gl.isContextLost() && gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED)
+    await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+  gl.deleteSync(fence);
 }
 
 /**

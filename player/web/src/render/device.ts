@@ -73,8 +73,10 @@ export class Device {
   readonly isSparing: boolean;
   #objects = 0;
   #hasNewTextures = false;
+  /** Signalled once the card has made the textures that `hasMemory` asks for. */
+  #question: WebGLSync | null = null;
   readonly #vertices: WebGLVertexArrayObject;
-  /** Until when programs may be taken in this frame: each waits a little for the card. */
+  /** Until when programs may be begun and taken in this frame: each waits a little for the card. */
   takesUntil = 0;
   readonly #compiling = new Set<Compilation>();
   readonly #parallel: KHR_parallel_shader_compile | null;
@@ -125,20 +127,33 @@ export class Device {
     return { handle, format, size };
   }
 
+  /** Whether `hasMemory` is waiting for the card; it answers without holding up the page if nothing is given to it. */
+  get isAsked(): boolean {
+    return this.#question !== null;
+  }
+
   /**
-   * Return whether there was no memory for a texture that was made since this was last asked, or for a framebuffer.
-   * Ask while the card is idle, for which this waits.
+   * Return whether there was memory for all textures that have been made, and for framebuffers.
+   * @returns null: the card has not come to them yet; ask again.
    */
-  lacksMemory(): boolean {
+  hasMemory(): boolean | null {
     const { gl } = this;
-    if (!this.#hasNewTextures) return false;
-    this.#hasNewTextures = false;
+    if (this.#question === null) {
+      if (!this.#hasNewTextures) return true;
+      this.#hasNewTextures = false;
+      this.#question = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+      gl.flush();
+    }
+    const isAnswered = this.#question === null || gl.getSyncParameter(this.#question, gl.SYNC_STATUS) === gl.SIGNALED;
+    if (!isAnswered && !gl.isContextLost()) return null;
+    gl.deleteSync(this.#question);
+    this.#question = null;
     let isLacking = false;
     for (let error = gl.getError(); error !== gl.NO_ERROR; error = gl.getError()) {
-      if (error === gl.CONTEXT_LOST_WEBGL) return false;
+      if (error === gl.CONTEXT_LOST_WEBGL) return true;
       isLacking ||= error === gl.OUT_OF_MEMORY;
     }
-    return isLacking;
+    return !isLacking;
   }
 
   /** Replace a part of a texture, all of it or the rectangle of `size` texels at (x, y); Uint16 are halves. */
@@ -337,6 +352,8 @@ export class Device {
 
   /** Delete what the device itself has made. */
   dispose(): void {
+    this.gl.deleteSync(this.#question);
+    this.#question = null;
     this.gl.deleteVertexArray(this.#vertices);
     this.#objects--;
   }

@@ -72,7 +72,7 @@ const ASSUMED_SECONDS = { card: 2e-7, processor: 1e-5 };
 const FPS = { card: 30, processor: 10 };
 /** Rays for a pixel of the first pictures on a card, before it is known how fast it is. */
 export const FIRST_RAYS = 0.1;
-/** Milliseconds of a frame after which programs that are compiled wait for the next one. */
+/** Milliseconds of a frame after which programs that are to be compiled, or are, wait for the next one. */
 const TAKING_MS = 4;
 /** How fast what is known of it follows what is measured. */
 const NEW_WEIGHT = 0.5;
@@ -161,16 +161,16 @@ export class Renderer {
 
   /** Take rows of a scene that has arrived, as many as a frame has time for; `draw` does so for those that it shows. */
   upload(scene: DrawnScene): void {
-    if (!this.isLost) scene.upload(this.#device);
+    if (!this.isLost && !this.#device.isAsked) scene.upload(this.#device);
   }
 
   removeScene(scene: DrawnScene): void {
     if (this.#scenes.delete(scene)) scene.release();
   }
 
-  /** Have shaders compiled that `draw` will need, while planes are still to come. */
-  prepare(camera: Camera, moments: readonly Moment[], options: DrawOptions = {}): void {
-    if (!this.isLost) this.#isReady(viewOf(camera, moments, options), this.#wanted(camera, moments, options));
+  /** Have shaders compiled that `draw` will need, while planes are still to come; return whether all are. */
+  prepare(camera: Camera, moments: readonly Moment[], options: DrawOptions = {}): boolean {
+    return this.isLost || this.#isReady(viewOf(camera, moments, options), this.#wanted(camera, moments, options));
   }
 
   /**
@@ -183,7 +183,7 @@ export class Renderer {
     const { level = 'auto' } = options;
     const isAuto = level === 'auto';
     const wanted = this.#wanted(camera, moments, options);
-    if (this.isLost || this.#timer.isBusy || this.#sparesMemory()) return this.#state(wanted, false);
+    if (this.isLost || this.#timer.isBusy || !this.#hasMemory()) return this.#state(wanted, false);
     for (const scene of this.#scenes) scene.upload(this.#device);
     const view = viewOf(camera, moments, options);
     const versions = moments.map(({ scene }) => scene.source.version).join();
@@ -216,8 +216,8 @@ export class Renderer {
     const { level = 'auto' } = options;
     const [{ camera, projection }] = frames;
     const wanted = this.#wanted(camera, moments, options);
-    if (this.isLost || (!this.#timer.isBusy && this.#sparesMemory())) return this.#state(wanted, false);
-    for (const scene of this.#scenes) scene.upload(this.#device);
+    if (this.isLost || (!this.#timer.isBusy && this.#hasMemory() === false)) return this.#state(wanted, false);
+    for (const scene of this.#scenes) this.upload(scene);
     const background = projection ? [0, 0, 0] : options.background;
     const views = frames.map(({ camera }) => viewOf(camera, moments, { ...options, background }));
     const merging = projection && this.#mergingOn(this.#device);
@@ -383,17 +383,18 @@ export class Renderer {
   }
 
   /**
-   * If the card had no memory for a texture, begin anew with smaller ones.
-   * @returns whether that was so; there is nothing to draw yet, then.
+   * Whether the card had memory for all textures; if not, begin anew with smaller ones.
+   * @returns null: the card has not come to them yet.
    * @throws RenderError: they were small already.
    */
-  #sparesMemory(): boolean {
-    if (!this.#device.lacksMemory()) return false;
+  #hasMemory(): boolean | null {
+    const hasMemory = this.#device.hasMemory();
+    if (hasMemory !== false) return hasMemory;
     const { isSparing, name } = this.#device;
     this.#releaseAll();
     this.#beginAnew(true);
     if (isSparing) throw new RenderError(`${name} has no memory for the textures of the scene`, 'budget');
-    return true;
+    return false;
   }
 
   #releaseAll(): void {
