@@ -17,7 +17,7 @@ from kpc.encoder.evaluation.ablations import ABLATIONS, effective_ablations
 from kpc.encoder.field.config import PRESETS
 from kpc.format.coding.quantise import quantise_scene
 from kpc.player.quality import DEFAULT, LEVELS
-from kpc.tools.bench import harness, kpbench, machine_limits, plot, results, tables
+from kpc.tools.bench import harness, kpbench, machine_limits, plot, results, scaling, tables
 from kpc.tools.bench.provenance import data_hash
 from scenes import tiny_scene
 
@@ -125,6 +125,30 @@ def test_step_compares_with_plain_pytorch_and_the_machine(
     assert run["rays_per_s"] > run["plain_rays_per_s"] > 0 and run["limits"]["gflops"] > 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["step.json", "tiny"]
     assert "rays/s" in capsys.readouterr().err and "speedup" in tables.markdown([record])
+
+
+def test_scaling_changes_one_thing_at_a_time(
+    here: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    base = scaling.BASE
+    for size in scaling.sizes():
+        changed = [name for name, value in vars(size.scene).items() if value != vars(base)[name]]
+        assert len(changed) + (size.ablation != "baseline") <= 2
+    axes: dict[str, list[float]] = {size.axis: [] for size in scaling.sizes()}
+    for size in scaling.sizes():
+        axes[size.axis].append(size.amount)
+    assert len(axes) == 5 and all(amounts[0] < amounts[1] < amounts[2] for amounts in axes.values())
+    tiny = replace(base, cameras=3, frames=3, width=40, height=32)
+    some = [scaling.Size("frames", frames, replace(tiny, frames=frames)) for frames in (3, 6)]
+    monkeypatch.setattr(scaling, "sizes", lambda: [*some, scaling.Size("cameras", 3, tiny)])
+    out = tmp_path / "scaling.json"
+    assert kpbench.main(["scaling", "--steps", "2", "--repeats", "2", "--out", str(out)]) == 0
+    small, large, same = results.load([out])
+    assert same["repeats"] == small["repeats"] != large["repeats"] and len(small["repeats"]) == 2
+    assert [record["settings"]["amount"] for record in (small, large, same)] == [3, 6, 3]
+    assert small["data_sha256"] == same["data_sha256"] != large["data_sha256"]
+    assert all(run["read_s"] > 0 and run["rest_s"] > 0 and run["size_bytes"] > 0 for run in small["repeats"])
+    assert "reading s" in capsys.readouterr().err
 
 
 def test_curve_encodes_once_per_duration(here: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,12 +1,13 @@
 """What a batch leaves: the results by name, a table, and report.html."""
 
-import html
 import json
 from collections.abc import Mapping, Sequence
+from urllib.parse import quote
 
 from kpc.tools.batch.jobs import Job
 from kpc.tools.batch.store import SCENE, Store
 from kpc.tools.batch.tasks import Outcome
+from kpc.tools.pages import render
 
 # The folder below the output that all workers share.
 SHARED = ".kpbatch"
@@ -19,15 +20,6 @@ COLUMNS = (
     ("SSIM", "test_ssim", "{:.4f}"),
     ("encode s", "encode_s", "{:.0f}"),
 )
-STYLE = """
-:root { color-scheme: light dark; font: 15px/1.5 system-ui, sans-serif }
-body { margin: 2rem auto; max-width: 70rem; padding: 0 1rem }
-table { border-collapse: collapse; width: 100% }
-th, td { padding: .3rem .6rem; text-align: right; border-bottom: 1px solid #8885; white-space: nowrap }
-th:first-child, td:first-child { text-align: left }
-.failed { color: #c33; white-space: pre-wrap; text-align: left }
-.wide { overflow-x: auto }
-"""
 
 
 def publish(jobs: Sequence[Job], ended: Mapping[str, Outcome], store: Store, output: Store) -> int:
@@ -63,24 +55,16 @@ def print_summary(jobs: Sequence[Job], ended: Mapping[str, Outcome], as_json: bo
 
 def write_report(jobs: Sequence[Job], ended: Mapping[str, Outcome], output: Store) -> None:
     """Write report.html: the table, with what went wrong and links to files and logs; it needs no network."""
-    head = "".join(f"<th>{heading}</th>" for heading in ("job", *(heading for heading, _, _ in COLUMNS), "log"))
     rows = []
     for job in jobs:
-        outcome, name = ended.get(job.name), html.escape(job.name)
-        link = f'<a href="{name}.kpc">{name}</a>' if outcome and outcome.is_done else name
-        cells = "".join(f"<td>{cell}</td>" for cell in _cells(ended, job))
-        log = f'<a href="{SHARED}/{outcome.key}/log.txt">log</a>' if outcome else ""
-        rows.append(f"<tr><td>{link}</td>{cells}<td>{log}</td></tr>")
-        if error := _error(ended, job):
-            rows.append(f'<tr><td class="failed" colspan="{len(COLUMNS) + 2}">{html.escape(error)}</td></tr>')
+        outcome = ended.get(job.name)
+        row = {"name": job.name, "cells": _cells(ended, job), "error": _error(ended, job)}
+        row["file"] = quote(f"{job.name}.kpc") if outcome and outcome.is_done else ""
+        row["log"] = f"{SHARED}/{outcome.key}/log.txt" if outcome else ""
+        rows.append(row)
     done = sum(outcome.is_done for outcome in ended.values())
-    text = (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>kpbatch</title>'
-        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style>'
-        f"<h1>{done} of {len(jobs)} jobs done</h1>"
-        f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div></html>\n'
-    )
-    output.put_text(text, "report.html")
+    headings = [heading for heading, _, _ in COLUMNS]
+    output.put_text(render("batch.html", done=done, rows=rows, headings=headings), "report.html")
 
 
 def _cells(ended: Mapping[str, Outcome], job: Job) -> list[str]:

@@ -304,6 +304,25 @@ COLUMNS: dict[str, list[Column]] = {
         ("two threads ms", number("two_threads_ms", "{:.1f}")),
         ("slowest segment ms", number("slowest_segment_ms", "{:.1f}")),
     ],
+    "scaling": [
+        ("by", _setting("axis")),
+        ("amount", _setting("amount", "{:g}")),
+        ("preset", _setting("preset")),
+        ("reading s", number("read_s", "{:.2f}")),
+        ("training s", number("train_s", "{:.1f}")),
+        ("the rest s", number("rest_s", "{:.1f}")),
+        ("M param", number("parameters", "{:.2f}", 1e6)),
+        ("file KB", number("size_bytes", "{:.0f}", 1e3)),
+        ("peak MB", number("peak_memory_bytes", "{:.0f}", 1e6)),
+    ],
+    "pictures": [
+        ("scene", _name),
+        ("dataset", _setting("dataset")),
+        ("views", lambda r: str(len(r["views"]))),
+        ("PSNR dB", number("psnr", "{:.2f}")),
+        ("moving", number("moving_psnr", "{:.2f}")),
+        ("still", number("still_psnr", "{:.2f}")),
+    ],
 }
 
 # Columns of the table that kpbench prints, which is to fit a terminal; all others are in its JSON.
@@ -323,6 +342,8 @@ PRINTED: dict[str, tuple[str, ...]] = {
     "groups": ("dataset", "groups", "file KB", "PSNR dB", "encoded in s", "peak MB, all"),
     "entropy": ("scene", "variant", "planes KB", "decoding ms", "file KB", "reading ms"),
     "decode": ("scene", "segments", "symbols", "one thread ms", "two threads ms", "slowest segment ms"),
+    "scaling": ("by", "amount", "reading s", "training s", "the rest s", "peak MB"),
+    "pictures": ("scene", "dataset", "views", "PSNR dB", "moving", "still"),
 }
 TITLES = {
     "encode": "Encoding",
@@ -340,4 +361,6 @@ TITLES = {
     "codec": "Coding, beside general-purpose codecs",
     "entropy": "Entropy coding of planes, ablations, on one core",
     "decode": "Decoding by the decoder core",
+    "scaling": "Encoding by the size of the work",
+    "pictures": "Pictures beside truth",
 }

@@ -17,6 +17,7 @@ from kpc.tools.bench.records import Record
 Run = tuple[Path, dict[str, Any]]
 
 PRESETS = ("draft", "fast", "balanced", "best", "paper")
+DEFAULT_PRESET = "balanced"  # as for kpenc
 
 
 def add_parsers(kinds: Any) -> None:
@@ -85,7 +86,9 @@ def add_parsers(kinds: Any) -> None:
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
-    parser.add_argument("--preset", choices=PRESETS, default="balanced", help="preset of kpenc (default: balanced)")
+    parser.add_argument(
+        "--preset", choices=PRESETS, default=DEFAULT_PRESET, help="preset of kpenc (default: %(default)s)"
+    )
     parser.add_argument(
         "--seed", type=int, default=0, help="seed of the first repeat; each further one adds 1 (default: 0)"
     )
@@ -155,7 +158,7 @@ def _encodings(kind: str, options: argparse.Namespace, origin: Record, runs: Seq
                     keep_checkpoint=kept / f"{label}{suffix}.kpck" if options.keep_scenes else None,
                     **changes,
                 )
-                device, outcome = harness.isolated(_encode_once, job)
+                device, outcome = harness.isolated(encode_once, job)
                 record["repeats"].append(outcome)
             yield record | {"renderer": device}
 
@@ -212,7 +215,7 @@ def _groups(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
                 keep=True,
             )
             print(f"kpbench: {record['name']}, {options.preset}, groups of {options.group:g} s", file=sys.stderr)
-            device, found = harness.isolated(_encode_once, job)
+            device, found = harness.isolated(encode_once, job)
             groups = found.pop("groups")
             first_peak = groups[0]["peak_memory_bytes"]
             repeat = found | {"groups": len(groups), "first_group_peak_memory_bytes": first_peak}
@@ -251,7 +254,7 @@ def _ablations(job: Any) -> list[str]:
     return names
 
 
-def _encode_once(job: Any) -> tuple[str, Record]:
+def encode_once(job: Any) -> tuple[str, Record]:
     """Encode; return the device and what kpenc reports."""
     import torch
 

@@ -14,7 +14,9 @@
     kpbench codec room.kpck liam.kpc --dataset room --dataset liam --out docs/bench/codec.json
     kpbench entropy room.kpc liam.kpc --out docs/bench/entropy.json
     kpbench decode room.kpc liam.kpc --out docs/bench/decode.json
+    kpbench scaling --repeats 3 --out docs/bench/scaling.json
     kpbench compare old.json new.json
+    kpbench report docs/bench/*.json -o report.html
 
 Every record states what was run (commit, command, seed, settings), on what (machine, renderer, versions, SHA-256 of the
 data) and the result of every repeat; see `kpc.tools.bench.records`. The output is one JSON list: with --out it is
@@ -24,12 +26,19 @@ written after every record, otherwise to stdout at the end. Every repeat runs in
 import argparse
 import shlex
 import sys
+from importlib import import_module
 from pathlib import Path
 
 from kpc.format.common import cli
-from kpc.tools.bench import coding_commands, compare, encoding_commands, playing_commands, tables
+from kpc.tools.bench import coding_commands, encoding_commands, playing_commands, scaling, tables
 from kpc.tools.bench.provenance import commit, machine, versions
 from kpc.tools.bench.records import Record, as_json
+
+# Subcommands that measure nothing themselves: their module, loaded where it is needed, and what they do.
+APART = {
+    "compare": ("compare", "what is better and worse in new records than in old ones"),
+    "report": ("report.page", "one page with the curves of all trades"),
+}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -38,8 +47,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    if argv[:1] == ["compare"]:
-        compare.main(argv[1:])
+    if argv and argv[0] in APART:
+        import_module(f"kpc.tools.bench.{APART[argv[0]][0]}").main(argv[1:])
         return
     options = _parser().parse_args(argv)
     origin = {
@@ -74,10 +83,11 @@ def _parser() -> argparse.ArgumentParser:
     kinds = parser.add_subparsers(
         dest="kind",
         required=True,
-        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|web|codec|entropy|decode|compare",
+        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|web|codec|entropy|decode|scaling|compare|report",
     )
-    kinds.add_parser("compare", add_help=False, help="what is better and worse in new records than in old ones")
-    for module in (encoding_commands, playing_commands, coding_commands):
+    for name, (_, help) in APART.items():
+        kinds.add_parser(name, add_help=False, help=help)
+    for module in (encoding_commands, playing_commands, coding_commands, scaling):
         module.add_parsers(kinds)
     for kind in kinds.choices.values():
         kind.add_argument(

@@ -16,8 +16,8 @@ from pathlib import Path
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError
 from kpc.tools.bench import records as record_files
-from kpc.tools.bench.records import Record
 from kpc.tools.bench.columns import TITLES
+from kpc.tools.bench.records import Record
 from kpc.tools.bench.tables import cells, glance, machine_name, markdown, tables
 
 # A pair of markers: begin marker, name, what stands between, end marker.

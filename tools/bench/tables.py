@@ -63,7 +63,7 @@ def tables(kind: str, records: Iterable[Record]) -> str:
             parts.append("Size and PSNR loss by `--quality`:")
             parts.append(_as_markdown(_quality_table(rows)))
         runs = sorted({len(record["repeats"]) for record in rows})
-        commits = ", ".join(dict.fromkeys(_short(record["commit"]) for record in rows))
+        commits = ", ".join(dict.fromkeys(short_commit(record["commit"]) for record in rows))
         commands = "; ".join(dict.fromkeys(f"`{record['command']}`" for record in rows))
         source = f"Commit {commits}; median of {' or '.join(map(str, runs))} run{'s' * (runs != [1])}; {commands}."
         parts.append(textwrap.fill(source, 120, break_long_words=False, break_on_hyphens=False))
@@ -150,6 +150,6 @@ def machine_name(record: Record) -> str:
     return processor if record["renderer"] == "cpu" else f"{record['renderer']} ({processor})"
 
 
-def _short(commit: str) -> str:
+def short_commit(commit: str) -> str:
     digits, plus, dirty = commit.partition("+")
     return digits[:9] + plus + dirty

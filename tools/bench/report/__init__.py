@@ -1,0 +1,1 @@
+"""kpbench report: the trades of KPC, drawn from benchmark records on one page."""
