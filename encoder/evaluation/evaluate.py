@@ -219,30 +219,71 @@ def evaluate(
         return None
     if most is not None:
         held_out = spread_evenly(dataset.pictures, held_out, most)
-    renderer, moving = SceneRenderer(scene, field), MovingPixels(dataset)
+    renderer = SceneRenderer(scene, field)
+    moving = MovingPixels(dataset) if parts else None
     scores: list[tuple[float, float]] = []
-    moving_psnr: list[float] = []
-    still_psnr: list[float] = []
+    of_parts: dict[str, list[float]] = {"moving": [], "still": []}
     for number in progress(held_out.tolist(), label or "", unit="pictures", shown=label is not None):
-        start, code = 0, None
-        if scene.appearances:
-            start, code = _middle(dataset, number), renderer.fit_left_half(dataset, number)
-        picture = np.clip(renderer.picture(dataset, number, start, code), 0, 1)
-        truth = ground_truth(dataset, number)[:, start:]
-        usable = np.ones(truth.shape[:2], bool) if dataset.masks is None else dataset.usable(number)[:, start:]
-        if dataset.masks is None:
-            scores.append((psnr(picture, truth), ssim(picture, truth)))
-        else:
-            scores.append((psnr(picture[usable], truth[usable]), ssim(picture, truth, usable)))
-        if parts and (mask := moving.mask(number)) is not None:
-            for found, of_part in ((moving_psnr, mask[:, start:]), (still_psnr, ~mask[:, start:])):
-                if (chosen := of_part & usable).any():
-                    found.append(psnr(picture[chosen], truth[chosen]))
+        found = compare(renderer, dataset, number)
+        scores.append((found.psnr(), ssim(found.picture, found.truth, None if dataset.masks is None else found.usable)))
+        if moving is not None:
+            for part, chosen in found.parts(moving.mask(number)).items():
+                of_parts[part].append(found.psnr(chosen))
     mean_psnr, mean_ssim = np.mean(scores, axis=0)
     quality = Quality(float(mean_psnr), float(mean_ssim), len(scores))
-    if not moving_psnr or not still_psnr:
+    if not all(of_parts.values()):
         return quality
-    return replace(quality, moving_psnr=float(np.mean(moving_psnr)), still_psnr=float(np.mean(still_psnr)))
+    moving_psnr, still_psnr = (float(np.mean(of_parts[part])) for part in ("moving", "still"))
+    return replace(quality, moving_psnr=moving_psnr, still_psnr=still_psnr)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The columns of a held-out picture that count, as they are rendered and as they were filmed.
+
+    Attributes:
+        picture, truth: (H, W, 3) float32 in [0, 1], rendered and filmed.
+        usable: (H, W) bool, the pixels that count.
+        first: the column of the whole picture at which they begin.
+    """
+
+    picture: np.ndarray
+    truth: np.ndarray
+    usable: np.ndarray
+    first: int
+
+    @property
+    def error(self) -> np.ndarray:
+        """The difference of rendered and filmed colours, (H, W, 3) float32."""
+        return self.picture - self.truth
+
+    def psnr(self, chosen: np.ndarray | None = None) -> float:
+        """Return the PSNR in dB of the usable pixels, or of some (H, W) bool of them."""
+        where = self.usable if chosen is None else chosen
+        return psnr(self.picture[where], self.truth[where])
+
+    def parts(self, moving: np.ndarray | None) -> dict[str, np.ndarray]:
+        """Return the usable pixels that move, "moving", and the others, "still", (H, W) bool, where there are any.
+
+        Args:
+            moving: (H, W') bool, the moving pixels of the whole picture (`MovingPixels`); None if they are unknown.
+        """
+        if moving is None:
+            return {}
+        mask = moving[:, self.first :]
+        found = {"moving": mask & self.usable, "still": ~mask & self.usable}
+        return {part: chosen for part, chosen in found.items() if chosen.any()}
+
+
+def compare(renderer: SceneRenderer, dataset: Dataset, number: int) -> Comparison:
+    """Render a picture of the dataset beside what was filmed; `evaluate` says which of its pixels count."""
+    first, code = 0, None
+    if renderer.scene.appearances:
+        first, code = _middle(dataset, number), renderer.fit_left_half(dataset, number)
+    picture = np.clip(renderer.picture(dataset, number, first, code), 0, 1)
+    truth = ground_truth(dataset, number)[:, first:]
+    usable = np.ones(truth.shape[:2], bool) if dataset.masks is None else dataset.usable(number)[:, first:]
+    return Comparison(picture, truth, usable, first)
 
 
 def testable_pictures(dataset: Dataset, right_halves: bool) -> np.ndarray:
@@ -256,9 +297,7 @@ def testable_pictures(dataset: Dataset, right_halves: bool) -> np.ndarray:
     if dataset.masks is None:
         return held_out
     starts = [_middle(dataset, number) if right_halves else 0 for number in held_out.tolist()]
-    usable = [
-        bool(_centres(dataset.usable(n)[:, start:]).any()) for n, start in zip(held_out.tolist(), starts, strict=True)
-    ]
+    usable = [has_windows(dataset.usable(n)[:, start:]) for n, start in zip(held_out.tolist(), starts, strict=True)]
     return held_out[np.array(usable, bool)]
 
 
@@ -318,6 +357,11 @@ def ssim(a: np.ndarray, b: np.ndarray, usable: np.ndarray | None = None) -> floa
     if usable is not None:
         values = values[:, 0, torch.from_numpy(_centres(usable))]
     return float(values.mean())
+
+
+def has_windows(usable: np.ndarray) -> bool:
+    """Return whether any window of SSIM counts where only some pixels, (H, W) bool, are usable."""
+    return bool(_centres(usable).any())
 
 
 def _window(height: int, width: int) -> int:

@@ -124,6 +124,15 @@ ENCODED: list[Column] = [
     ("file KB", number("size_bytes", "{:.0f}", 1e3)),
 ]
 
+# All pixels, those that move, and the others: what headings and keys of their measures begin with.
+PARTS = ("", "moving ", "still ")
+
+
+def _of_parts(heading: str, key: str, text: str, unit: float = 1.0) -> list[Column]:
+    """Return the columns of one measure of all, moving and still pixels."""
+    return [(part + heading, number(part.replace(" ", "_") + key, text, unit)) for part in PARTS]
+
+
 COLUMNS: dict[str, list[Column]] = {
     "encode": [
         *ENCODED,
@@ -296,6 +305,16 @@ COLUMNS: dict[str, list[Column]] = {
         ("file KB", number("file_bytes", "{:.1f}", 1e3)),
         ("reading ms", number("read_ms", "{:.0f}")),
     ],
+    "quality": [
+        ("scene", _name),
+        ("dataset", _setting("dataset")),
+        ("pictures", number("pictures", "{:.0f}")),
+        ("moves", number("moving_share", "{:.0%}")),
+        *_of_parts("PSNR", "psnr", "{:.2f}"),
+        *_of_parts("SSIM", "ssim", "{:.3f}"),
+        *_of_parts("FLIP", "flip", "{:.3f}"),
+        *_of_parts("flicker", "flicker", "{:.2f}", 1 / 255),
+    ],
     "decode": [
         ("scene", _name),
         ("segments", number("segments", "{:.0f}")),
@@ -341,6 +360,7 @@ PRINTED: dict[str, tuple[str, ...]] = {
     "codec": ("scene", "coder", "KB at 0.15 dB loss", "PSNR loss dB", "encode s", "decode s"),
     "groups": ("dataset", "groups", "file KB", "PSNR dB", "encoded in s", "peak MB, all"),
     "entropy": ("scene", "variant", "planes KB", "decoding ms", "file KB", "reading ms"),
+    "quality": ("scene", "pictures", "PSNR", "moving PSNR", "FLIP", "flicker"),
     "decode": ("scene", "segments", "symbols", "one thread ms", "two threads ms", "slowest segment ms"),
     "scaling": ("by", "amount", "reading s", "training s", "the rest s", "peak MB"),
     "pictures": ("scene", "dataset", "views", "PSNR dB", "moving", "still"),
@@ -363,4 +383,5 @@ TITLES = {
     "decode": "Decoding by the decoder core",
     "scaling": "Encoding by the size of the work",
     "pictures": "Pictures beside truth",
+    "quality": "Quality of held-out views, moving and still pixels apart",
 }

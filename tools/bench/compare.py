@@ -19,7 +19,7 @@ from kpc.tools.bench.records import Record, load
 
 # Endings of the names of figures of which more is better, and of which less is; those of both kinds of time.
 HIGHER = ("psnr", "psnr_min", "ssim", "agreement_db", "fps", "per_s", "gflops")
-LOWER = ("_bytes", "bytes", "_ms", "_s", "loss_db", "lpips", "ms_median", "ms_p95", "memory_bytes")
+LOWER = ("bytes", "_ms", "_s", "loss_db", "flip", "flicker", "max_error", "ms_median", "ms_p95")
 TIMES = ("fps", "per_s", "_ms", "_s", "ms_median", "ms_p95", "gflops")
 # Figures that end so, but say what a run was given or how long it was allowed to take.
 IGNORED = ("target", "seed", "time_budget_s", "rays", "steps", "received_bytes")

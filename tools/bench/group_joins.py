@@ -1,15 +1,16 @@
 """How steady a clip in groups is where one group takes over from another, measured on held-out views."""
 
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Set
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from kpc.encoder.datasets import Dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer
-from kpc.encoder.evaluation.ground_truth import ground_truth
+from kpc.encoder.evaluation.evaluate import Comparison, SceneRenderer, compare, testable_pictures
 from kpc.encoder.rdo.codec_model import widen_single_texels
+from kpc.format.common.errors import UsageError
 from kpc.format.common.fidelity import psnr
 from kpc.format.container import scene_io
 from kpc.format.container.groups import Groups
@@ -58,45 +59,104 @@ class Join:
     p95_error_change: float
 
 
+@dataclass(frozen=True)
+class Shown:
+    """A frame of a held-out camera, as the clip shows it.
+
+    Attributes:
+        camera: the number of the camera.
+        name: of the camera.
+        frame: its number in the clip.
+        group: the group that shows it, or has the larger share of it.
+        key: says which picture of the dataset it is (`Pictures.offset`).
+        comparison: with what was filmed.
+        agreement: where two groups are blended, the later one and the PSNR in dB between their pictures.
+    """
+
+    camera: int
+    name: str
+    frame: int
+    group: int
+    key: int
+    comparison: Comparison
+    agreement: tuple[int, float] | None
+
+
+def shown_frames(groups: Groups, dataset: Dataset, wanted: Set[int] | None = None) -> Iterator[Shown]:
+    """Yield the held-out pictures of a clip's dataset, group by group, the frames of a camera in order.
+
+    One group is in memory at a time, and the pictures of frames that are blended with it.
+
+    Args:
+        groups: the clip, or a scene without groups.
+        dataset: with its held-out pictures.
+        wanted: keys of the pictures to yield; None for all.
+
+    Raises:
+        UsageError: the clip in groups is not as long as that of the dataset.
+    """
+    if not groups.is_single and groups.clip.frame_count != dataset.clip.frame_count:
+        raise UsageError(
+            f"{groups.name} has {groups.clip.frame_count} frames, {dataset.path} has {dataset.clip.frame_count}; give "
+            "the dataset that it was made from"
+        )
+    timeline, first = groups.timeline, groups.timeline.spans[0].start
+    blending: dict[int, np.ndarray] = {}  # by picture: how the earlier group renders it
+    for number, span in enumerate(timeline.spans):
+        some = dataset if groups.is_single else dataset.frame_range(span.start, span.last)
+        renderer = SceneRenderer(widen_single_texels(scene_io.read(groups.open(number))).dequantise())
+        pictures = some.pictures
+        frames = (
+            np.rint(pictures.time * (some.clip.frame_count - 1)).astype(int) + span.start - first
+        )  # of each picture
+        held_out = testable_pictures(some, right_halves=bool(renderer.scene.appearances)).tolist()
+        for picture in sorted(held_out, key=lambda p: (int(pictures.camera[p]), int(frames[p]))):
+            frame, key = int(frames[picture]), int(pictures.offset[picture])  # the key is the same in every group
+            shares = {part: share for part, _, share in timeline.blend_at(_time(groups, frame))}
+            if number not in shares or (wanted is not None and key not in wanted):
+                continue
+            found = compare(renderer, some, picture)
+            if number < max(shares):
+                blending[key] = found.picture
+                continue
+            agreement = None
+            if number > min(shares):
+                earlier, rendered = blending.pop(key), found.picture
+                agreement = number, psnr(earlier, rendered)
+                found = replace(found, picture=(1 - shares[number]) * earlier + shares[number] * rendered)
+            shown, _ = timeline.at(_time(groups, frame))
+            camera = int(pictures.camera[picture])
+            yield Shown(camera, some.camera_names[camera], frame, shown, key, found, agreement)
+
+
+def error_change(error: np.ndarray, before: np.ndarray, where: np.ndarray | None = None) -> float:
+    """Return the RMS difference between the errors of a picture and of the one before, visible as flicker.
+
+    Args:
+        error, before: (H, W, 3), rendered less filmed colours.
+        where: (H, W) bool, the pixels that count; None for all.
+    """
+    change = error - before
+    return float(np.sqrt(np.mean(np.square(change if where is None else change[where]))))
+
+
 def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
     """Compare a clip in groups with the held-out pictures of its dataset.
-
-    One group is in memory at a time, and for each camera the pictures of blended frames.
 
     Returns:
         `frames` and `joins`, the fields of `Frame` and `Join` as plain data.
     """
     groups = Groups(scene)
-    timeline, first = groups.timeline, groups.timeline.spans[0].start
-    blending: dict[int, np.ndarray] = {}  # by picture: how the earlier group renders it
     last_error: dict[int, np.ndarray] = {}  # by camera
     found: list[Frame] = []
-    agreements: list[list[float]] = [[] for _ in timeline.spans]
-    for number, span in enumerate(timeline.spans):
-        some = dataset.frame_range(span.start, span.last)
-        renderer = SceneRenderer(widen_single_texels(scene_io.read(groups.open(number))).dequantise())
-        frames = np.rint(some.pictures.time * (span.count - 1)).astype(int) + span.start - first  # of each picture
-        for picture in sorted(map(int, np.flatnonzero(some.pictures.is_test)), key=lambda p: int(frames[p])):
-            frame, camera = int(frames[picture]), int(some.pictures.camera[picture])
-            same = int(some.pictures.offset[picture])  # in every group
-            shares = {part: share for part, _, share in timeline.blend_at(_time(groups, frame))}
-            if number not in shares:
-                continue
-            rendered = np.clip(renderer.picture(some, picture), 0, 1)
-            if number < max(shares):
-                blending[same] = rendered
-                continue
-            if number > min(shares):
-                earlier = blending.pop(same)
-                agreements[number].append(psnr(earlier, rendered))
-                rendered = (1 - shares[number]) * earlier + shares[number] * rendered
-            error = rendered - ground_truth(some, picture)
-            change = None
-            if camera in last_error:
-                change = float(np.sqrt(np.mean(np.square(error - last_error[camera]))))
-            last_error[camera] = error
-            shown, _ = timeline.at(_time(groups, frame))
-            found.append(Frame(some.camera_names[camera], frame, shown, psnr(error, 0), change))
+    agreements: list[list[float]] = [[] for _ in groups.timeline.spans]
+    for shown in shown_frames(groups, dataset):
+        if shown.agreement is not None:
+            agreements[shown.agreement[0]].append(shown.agreement[1])
+        error, before = shown.comparison.error, last_error.get(shown.camera)
+        last_error[shown.camera] = error
+        change = None if before is None else error_change(error, before)
+        found.append(Frame(shown.name, shown.frame, shown.group, shown.comparison.psnr(), change))
     return {
         "frames": [asdict(frame) for frame in found],
         "joins": [asdict(join) for join in _joins(groups, found, agreements)],

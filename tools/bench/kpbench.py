@@ -15,6 +15,7 @@
     kpbench entropy room.kpc liam.kpc --out docs/bench/entropy.json
     kpbench decode room.kpc liam.kpc --out docs/bench/decode.json
     kpbench scaling --repeats 3 --out docs/bench/scaling.json
+    kpbench quality room.kpc room --out docs/bench/quality.json
     kpbench compare old.json new.json
     kpbench report docs/bench/*.json -o report.html
 
@@ -30,7 +31,7 @@ from importlib import import_module
 from pathlib import Path
 
 from kpc.format.common import cli
-from kpc.tools.bench import coding_commands, encoding_commands, playing_commands, scaling, tables
+from kpc.tools.bench import checking_commands, coding_commands, encoding_commands, playing_commands, scaling, tables
 from kpc.tools.bench.provenance import commit, machine, versions
 from kpc.tools.bench.records import Record, as_json
 
@@ -83,11 +84,12 @@ def _parser() -> argparse.ArgumentParser:
     kinds = parser.add_subparsers(
         dest="kind",
         required=True,
-        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|web|codec|entropy|decode|scaling|compare|report",
+        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|web|codec|entropy|decode|quality|scaling|"
+        "compare|report",
     )
     for name, (_, help) in APART.items():
         kinds.add_parser(name, add_help=False, help=help)
-    for module in (encoding_commands, playing_commands, coding_commands, scaling):
+    for module in (encoding_commands, playing_commands, coding_commands, checking_commands, scaling):
         module.add_parsers(kinds)
     for kind in kinds.choices.values():
         kind.add_argument(

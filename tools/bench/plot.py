@@ -4,9 +4,11 @@
     python -m kpc.tools.bench.plot docs/bench/codec.json -o docs/codec.svg
     python -m kpc.tools.bench.plot docs/bench/groups.json -o docs/groups.svg
     python -m kpc.tools.bench.plot docs/bench/player.json -o docs/player.svg
+    python -m kpc.tools.bench.plot docs/bench/quality.json -o docs/quality.svg
 
 Records of `kpbench curve` give quality and size against training time, those of `codec` rate against distortion, those
-of `groups` the PSNR of each frame, those of `player` accuracy against frame time. The suffix of the output chooses SVG,
+of `groups` the PSNR of each frame, those of `player` accuracy against frame time, those of `quality` each measure of
+each frame. The suffix of the output chooses SVG,
 PNG or PDF. Needs the extra `bench`: `pip install ".[bench]"` in a checkout.
 """
 
@@ -28,6 +30,15 @@ from kpc.tools.bench.tables import is_ours
 
 # Panels of the training plot: the key of a repeat, the title, and the unit of the axis.
 PANELS = (("test_psnr", "held-out PSNR, dB", 1.0), ("test_ssim", "held-out SSIM", 1.0), ("size_bytes", "file, KB", 1e3))
+
+# Panels of the plot of quality: the key of a frame, the title, and what the axis multiplies it by.
+MEASURES = (
+    ("psnr", "PSNR, dB", 1.0),
+    ("ssim", "SSIM", 1.0),
+    ("flip", "FLIP error", 1.0),
+    ("flicker", "flicker, 8-bit levels", 255.0),
+)
+PART_COLOURS = {"": "0.3", "moving_": "C1", "still_": "C0"}
 
 SUFFIXES = (".svg", ".png", ".pdf")
 
@@ -148,6 +159,45 @@ def per_frame(records: Sequence[Record]) -> Figure:
     return figure
 
 
+def fidelity(records: Sequence[Record]) -> Figure:
+    """Draw each measure of each held-out picture from records of `kpbench quality`, moving and still pixels apart.
+
+    There is a column for each scene. Pictures are counted along the axis where no camera has more than one.
+
+    Raises:
+        FormatError: there is nothing to draw.
+    """
+    scenes = [record for record in records if record["kind"] == "quality" and record["frames"]]
+    if not scenes:
+        raise FormatError("no records of kpbench quality to draw; write some with kpbench quality --out")
+    width, height = PANEL_INCHES
+    size = (1.5 * width * len(scenes), 0.7 * height * len(MEASURES))
+    figure = Figure(figsize=size, layout="constrained")
+    columns = figure.subplots(len(MEASURES), len(scenes), squeeze=False, sharex="col").T
+    for column, record in zip(columns, scenes, strict=True):
+        lines: dict[str, list[Record]] = {}
+        for frame in record["frames"]:
+            lines.setdefault(frame["camera"], []).append(frame)
+        is_clip = any(len(line) > 1 for line in lines.values())
+        series = list(lines.values()) if is_clip else [record["frames"]]
+        for axes, (key, title, unit) in zip(column, MEASURES, strict=True):
+            for part, label in (("", "all pixels"), ("moving_", "moving"), ("still_", "still")):
+                for number, line in enumerate(series):
+                    points = [
+                        (frame["frame"] if is_clip else place, unit * frame[part + key])
+                        for place, frame in enumerate(line)
+                        if frame[part + key] is not None
+                    ]
+                    if points:
+                        axes.plot(*zip(*points, strict=True), ".-", color=PART_COLOURS[part], linewidth=1, markersize=3)
+                        axes.lines[-1].set_label(label if number == 0 else "_")
+            axes.set(title=f"{record['name']}: {title}")
+            axes.grid(color="0.87")
+        column[0].legend(fontsize=8)
+        column[-1].set(xlabel="frame" if is_clip else "picture")
+    return figure
+
+
 def quality_levels(records: Sequence[Record]) -> Figure:
     """Draw PSNR to the reference against frame time from records of `kpbench player`.
 
@@ -213,13 +263,15 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser("plot", description="Draw records of kpbench curve, codec, groups or player.")
+    parser = argparse.ArgumentParser(
+        "plot", description="Draw records of kpbench curve, codec, groups, player or quality."
+    )
     cli.add_version_option(parser)
     parser.add_argument("records", type=Path, nargs="+", help="files that kpbench --out wrote")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the .svg, .png or .pdf file to write")
     options = parser.parse_args(argv)
     records = results.load(options.records)
-    kinds = {"codec": rate_distortion, "groups": per_frame, "player": quality_levels}
+    kinds = {"codec": rate_distortion, "groups": per_frame, "player": quality_levels, "quality": fidelity}
     draw = kinds.get(records[0]["kind"] if records else "", curves)
     save(draw(records), options.output)
     print(options.output)

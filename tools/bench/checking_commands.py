@@ -1,0 +1,77 @@
+"""The subcommands of kpbench that compare with the truth: quality."""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from kpc.format.common import cli
+from kpc.format.container.groups import Groups
+from kpc.tools.bench import harness
+from kpc.tools.bench.provenance import data_hash
+from kpc.tools.bench.records import Record
+
+
+def add_parsers(kinds: Any) -> None:
+    """Add the subcommands to the subparsers `kinds`."""
+    quality = kinds.add_parser(
+        "quality",
+        help="how near a scene is to held-out views, frame by frame, moving and still pixels apart",
+        description="Compare a scene with the held-out views of its dataset by PSNR, SSIM, FLIP and flicker. With "
+        "--out FILE.json also write FILE.csv and FILE.svg, with every frame.",
+    )
+    quality.add_argument("scene", type=cli.input_path, metavar="SCENE", help="a .kpc file")
+    quality.add_argument("dataset", type=Path, metavar="DATASET", help="the folder that it was made from")
+    quality.add_argument("--holdout", metavar="NAME", help="camera or file to compare with (default: as encoded)")
+    quality.add_argument(
+        "--downscale", type=harness.positive, metavar="N", help="average blocks of N x N pixels (default: as encoded)"
+    )
+    quality.add_argument(
+        "--test-views",
+        type=harness.positive,
+        metavar="N",
+        help="compare with at most N held-out pictures, spread over time, which leaves no flicker (default: all)",
+    )
+    quality.set_defaults(measure=_quality)
+
+
+def _quality(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
+    """Yield one record; beside --out FILE.json, FILE.csv and FILE.svg hold every frame."""
+    harness.encoder()  # reports a missing package before anything is read
+    from kpc.tools.bench import quality  # needs torch
+
+    if options.out is not None:
+        from kpc.tools.bench import plot  # needs matplotlib
+    made = Groups(options.scene).metadata().provenance
+    encoded: dict[str, Any] = dict(made.get("options", {}))
+    holdout = options.holdout or encoded.get("holdout")
+    downscale = options.downscale or int(encoded.get("downscale", 1))
+    folder = harness.existing_folder(options.dataset)
+    if encoded.get("refine", "none") != "none":
+        print(
+            f"kpbench: {options.scene.name} was trained with refined cameras; held-out views are drawn from where the "
+            "dataset puts them",
+            file=sys.stderr,
+        )
+    settings = {
+        "dataset": folder.resolve().name,
+        "holdout": holdout,
+        "downscale": downscale,
+        "test_views": options.test_views,
+    }
+    record = harness.new_record("quality", options.scene, origin, settings)
+    record |= {"dataset_sha256": data_hash(folder), "seed": None, "renderer": "cpu"}
+    print(f"kpbench: {record['name']}, against {settings['dataset']}", file=sys.stderr)
+    found = harness.isolated(
+        quality.measure, quality.Job(options.scene, folder, holdout, downscale, options.test_views)
+    )
+    record |= {"frames": found["frames"], "repeats": [found["means"]]}
+    print(quality.frame_table(found["frames"]), file=sys.stderr)
+    if found["means"]["flip"] is None:
+        print('kpbench: FLIP needs flip-evaluator; pip install "kpc[bench]"', file=sys.stderr)
+    yield record
+    if options.out is not None:
+        with cli.atomic_write(options.out.with_suffix(".csv")) as aside:
+            aside.write_text(quality.as_csv([record]))
+        plot.save(plot.fidelity([record]), options.out.with_suffix(".svg"))
