@@ -269,6 +269,8 @@ COLUMNS: dict[str, list[Column]] = {
         ("first picture ms", number("first_picture_ms", "{:.0f}")),
         ("longest task ms", number("longest_task_ms", "{:.0f}")),
         ("of the processor", number("longest_task_cpu_ms", "{:.0f}")),
+        ("seek ms", number("seek_unbuffered_ms", "{:.0f}")),
+        ("buffered seek ms", number("seek_buffered_ms", "{:.0f}")),
         ("fps", number("fps", "{:.1f}")),
         ("load of the machine", lambda r: f"{r['load_average']:.1f}"),
     ],

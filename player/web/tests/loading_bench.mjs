@@ -3,7 +3,9 @@
  *
  * A page calls `firstPicture()` once it shows something. Writes a list as JSON: milliseconds from navigation to that,
  * the longest task of the page's main thread until then, by the clock and by its processor time, bytes fetched, and
- * frames a second that are drawn on the canvas in the SECONDS after that.
+ * frames a second that are drawn on the canvas in the SECONDS after that. Of a page named seeks.html it writes instead
+ * milliseconds from a seek to the first picture there: once to the end of a clip of which nothing but the beginning has
+ * arrived, then to and fro within what is buffered there.
  */
 
 import { readFileSync } from 'node:fs';
@@ -97,6 +99,11 @@ async function measure(address, name) {
     const client = await page.context().newCDPSession(page);
     await client.send('Network.enable');
     await client.send('Network.emulateNetworkConditions', LINE);
+    if (name === 'seeks.html') {
+      await page.goto(`${address}/${name}`);
+      await page.waitForFunction(() => globalThis.found.first > 0, null, { timeout: 60_000 });
+      return await page.evaluate(seeks);
+    }
     let bytes = 0;
     client.on('Network.loadingFinished', ({ encodedDataLength }) => {
       bytes += encodedDataLength;
@@ -114,6 +121,39 @@ async function measure(address, name) {
   } finally {
     await browser.close();
   }
+}
+
+/** In the page: seek in a paused clip once it shows its beginning; return milliseconds until pictures are drawn. */
+async function seeks() {
+  const player = document.querySelector('kpc-player');
+  const { frames } = globalThis.found;
+  const nextFrame = () => new Promise(requestAnimationFrame);
+  /** Return the buffered part of the clip that holds a time; null if it is not buffered. */
+  const bufferedAt = (time) => {
+    const { buffered } = player;
+    for (let i = 0; i < buffered.length; i++)
+      if (buffered.start(i) <= time && time <= buffered.end(i)) return [buffered.start(i), buffered.end(i)];
+    return null;
+  };
+  const seek = async (time) => {
+    const start = document.timeline.currentTime;
+    player.currentTime = time;
+    while (player.seeking) await nextFrame();
+    const seeked = document.timeline.currentTime;
+    while (!(frames.at(-1) >= seeked)) await nextFrame();
+    return frames.find((at) => at >= seeked) - start;
+  };
+  const end = 0.8 * player.duration;
+  if (bufferedAt(end) !== null) throw new Error('the end of the clip arrived before it was sought');
+  const unbuffered = await seek(end);
+  const places = [0.1, 0.7, 0.3, 0.9, 0.5];
+  const buffered = [];
+  for (const share of places) {
+    for (let i = 0; i < 60; i++) await nextFrame();
+    const [from, to] = bufferedAt(player.currentTime);
+    buffered.push(await seek(from + share * (to - from)));
+  }
+  return { seek_unbuffered_ms: unbuffered, seek_buffered_ms: buffered.sort((a, b) => a - b)[places.length >> 1] };
 }
 
 const server = await serve();
