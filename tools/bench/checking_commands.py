@@ -1,4 +1,4 @@
-"""The subcommands of kpbench that compare with the truth: quality."""
+"""The subcommands of kpbench that compare with the truth: quality and pictures."""
 
 import argparse
 import sys
@@ -21,12 +21,6 @@ def add_parsers(kinds: Any) -> None:
         description="Compare a scene with the held-out views of its dataset by PSNR, SSIM, FLIP and flicker. With "
         "--out FILE.json also write FILE.csv and FILE.svg, with every frame.",
     )
-    quality.add_argument("scene", type=cli.input_path, metavar="SCENE", help="a .kpc file")
-    quality.add_argument("dataset", type=Path, metavar="DATASET", help="the folder that it was made from")
-    quality.add_argument("--holdout", metavar="NAME", help="camera or file to compare with (default: as encoded)")
-    quality.add_argument(
-        "--downscale", type=harness.positive, metavar="N", help="average blocks of N x N pixels (default: as encoded)"
-    )
     quality.add_argument(
         "--test-views",
         type=harness.positive,
@@ -34,6 +28,32 @@ def add_parsers(kinds: Any) -> None:
         help="compare with at most N held-out pictures, spread over time, which leaves no flicker (default: all)",
     )
     quality.set_defaults(measure=_quality)
+
+    pictures = kinds.add_parser(
+        "pictures",
+        help="held-out views beside the truth, and where they differ",
+        description="Keep the worst and the median of a scene's held-out views beside what was filmed, with maps of "
+        "their errors, for kpbench report.",
+    )
+    pictures.add_argument(
+        "--test-views",
+        type=harness.positive,
+        default=12,
+        metavar="N",
+        help="choose among N held-out pictures, spread over time (default: %(default)s)",
+    )
+    pictures.set_defaults(measure=_pictures)
+
+    for parser in (quality, pictures):
+        parser.add_argument("scene", type=cli.input_path, metavar="SCENE", help="a .kpc file")
+        parser.add_argument("dataset", type=Path, metavar="DATASET", help="the folder that it was made from")
+        parser.add_argument("--holdout", metavar="NAME", help="camera or file to compare with (default: as encoded)")
+        parser.add_argument(
+            "--downscale",
+            type=harness.positive,
+            metavar="N",
+            help="average blocks of N x N pixels (default: as encoded)",
+        )
 
 
 def _quality(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
@@ -43,6 +63,32 @@ def _quality(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
 
     if options.out is not None:
         from kpc.tools.bench import plot  # needs matplotlib
+    record, job = _beginning("quality", options, origin)
+    found = harness.isolated(quality.measure, job)
+    record |= {"frames": found["frames"], "repeats": [found["means"]]}
+    print(quality.frame_table(found["frames"]), file=sys.stderr)
+    if found["means"]["flip"] is None:
+        print('kpbench: FLIP needs flip-evaluator; pip install "kpc[bench]"', file=sys.stderr)
+    yield record
+    if options.out is not None:
+        with cli.atomic_write(options.out.with_suffix(".csv")) as aside:
+            aside.write_text(quality.as_csv([record]))
+        plot.save(plot.fidelity([record]), options.out.with_suffix(".svg"))
+
+
+def _pictures(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
+    """Yield one record, with the pictures in it."""
+    harness.encoder()
+    from kpc.tools.bench import picture_pairs  # needs torch
+
+    record, job = _beginning("pictures", options, origin)
+    yield record | harness.isolated(picture_pairs.measure, job)
+
+
+def _beginning(kind: str, options: argparse.Namespace, origin: Record) -> tuple[Record, Any]:
+    """Return a record before anything is measured, and the `quality.Job` of it: a scene and its dataset, as encoded."""
+    from kpc.tools.bench import quality  # needs torch
+
     made = Groups(options.scene).metadata().provenance
     encoded: dict[str, Any] = dict(made.get("options", {}))
     holdout = options.holdout or encoded.get("holdout")
@@ -60,18 +106,7 @@ def _quality(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
         "downscale": downscale,
         "test_views": options.test_views,
     }
-    record = harness.new_record("quality", options.scene, origin, settings)
+    record = harness.new_record(kind, options.scene, origin, settings)
     record |= {"dataset_sha256": data_hash(folder), "seed": None, "renderer": "cpu"}
     print(f"kpbench: {record['name']}, against {settings['dataset']}", file=sys.stderr)
-    found = harness.isolated(
-        quality.measure, quality.Job(options.scene, folder, holdout, downscale, options.test_views)
-    )
-    record |= {"frames": found["frames"], "repeats": [found["means"]]}
-    print(quality.frame_table(found["frames"]), file=sys.stderr)
-    if found["means"]["flip"] is None:
-        print('kpbench: FLIP needs flip-evaluator; pip install "kpc[bench]"', file=sys.stderr)
-    yield record
-    if options.out is not None:
-        with cli.atomic_write(options.out.with_suffix(".csv")) as aside:
-            aside.write_text(quality.as_csv([record]))
-        plot.save(plot.fidelity([record]), options.out.with_suffix(".svg"))
+    return record, quality.Job(options.scene, folder, holdout, downscale, options.test_views)

@@ -18,6 +18,7 @@
     kpbench quality room.kpc room --out docs/bench/quality.json
     kpbench compare old.json new.json
     kpbench report docs/bench/*.json -o report.html
+    kpbench suite -o records --plan
 
 Every record states what was run (commit, command, seed, settings), on what (machine, renderer, versions, SHA-256 of the
 data) and the result of every repeat; see `kpc.tools.bench.records`. The output is one JSON list: with --out it is
@@ -39,6 +40,7 @@ from kpc.tools.bench.records import Record, as_json
 APART = {
     "compare": ("compare", "what is better and worse in new records than in old ones"),
     "report": ("report.page", "one page with the curves of all trades"),
+    "suite": ("suite", "all of it from one commit, in less than an hour on generated scenes"),
 }
 
 
@@ -84,8 +86,8 @@ def _parser() -> argparse.ArgumentParser:
     kinds = parser.add_subparsers(
         dest="kind",
         required=True,
-        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|web|codec|entropy|decode|quality|scaling|"
-        "compare|report",
+        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|web|codec|entropy|decode|quality|pictures|"
+        "scaling|compare|report|suite",
     )
     for name, (_, help) in APART.items():
         kinds.add_parser(name, add_help=False, help=help)

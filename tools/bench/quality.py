@@ -100,7 +100,7 @@ def measure(job: Job) -> dict[str, Any]:
     groups = Groups(job.scene)
     with tempfile.TemporaryDirectory(prefix="kpbench-") as work:
         dataset = load_dataset(job.dataset, Path(work), holdout=job.holdout, downscale=job.downscale)
-        shown = _shown(groups, dataset, job.most)
+        shown = held_out_frames(groups, dataset, job.most)
         found = sorted(_frames(shown, dataset), key=lambda frame: (frame.camera, frame.frame))
     if not found:
         raise DatasetError(f"{job.dataset}: holds out no picture to compare with; give --holdout NAME")
@@ -108,7 +108,7 @@ def measure(job: Job) -> dict[str, Any]:
     return {"frames": frames, "means": means(frames)}
 
 
-def _shown(groups: Groups, dataset: Dataset, most: int | None) -> Iterator[Shown]:
+def held_out_frames(groups: Groups, dataset: Dataset, most: int | None) -> Iterator[Shown]:
     """Yield held-out pictures, those of a camera in the order of time."""
     held_out = testable_pictures(dataset, right_halves=bool(groups.open(0).appearances()))
     if most is not None and len(held_out):

@@ -123,8 +123,8 @@ def as_page(found: Sequence[Found]) -> str:
     pictures = _described(
         PICTURES,
         "Pictures beside truth",
-        "Held-out views as KPC renders them and as they were filmed: move the slider. Error maps show where the two "
-        "differ, the brighter the more.",
+        "Held-out views as KPC renders them and as they were filmed: move the slider. Below, "
+        "where the two differ, the brighter the more: orange where pixels move, blue where they are still.",
         (PICTURES,),
         kinds,
     )
