@@ -58,6 +58,7 @@ class Effort:
         scene: options of scenegen for DEFAULT.
         long: those for LONG.
         group: duration of its groups.
+        preset: of the encoding that is played.
         curves: minutes of training by preset.
         encode: options of the encodings by preset.
         steps: optimiser steps of ablations, scaling and groups.
@@ -69,6 +70,7 @@ class Effort:
     scene: tuple[str, ...]
     long: tuple[str, ...]
     group: str
+    preset: str
     curves: dict[str, str]
     encode: tuple[str, ...]
     steps: tuple[int, int, int]
@@ -81,6 +83,7 @@ HOUR = Effort(
     scene=(),
     long=("--frames", "90", "--cameras", "8", "--size", "128x96", "--samples", "1"),
     group="2.5s",
+    preset="balanced",
     curves={"fast": "0.5,1", "balanced": "1,2"},
     encode=(),
     steps=(200, 50, 200),
@@ -92,7 +95,8 @@ QUICK = Effort(
     scene=("--frames", "6", "--cameras", "4", "--size", "48x36", "--samples", "1"),
     long=("--frames", "12", "--cameras", "4", "--size", "48x36", "--samples", "1"),
     group="0.5s",
-    curves={"fast": "0.02,0.05", "balanced": "0.05"},
+    preset="draft",
+    curves={"draft": "0.02,0.05"},
     encode=("--steps", "30", "--test-views", "2"),
     steps=(5, 5, 20),
     frames=(3, 40),
@@ -107,10 +111,10 @@ def generated(effort: Effort) -> list[Step]:
     long_clip = Step("scene-long", (*scenegen, LONG, *effort.long), 0.5, (), (f"{LONG}/gt/cameras.json",), False)
     scene = Step("scene", (*scenegen, DEFAULT, *effort.scene), 0.8, (), (f"{DEFAULT}/gt/cameras.json",), False)
     ablate_steps, scaling_steps, group_steps = map(str, effort.steps)
-    main = "kept/default-balanced"
+    main = f"kept/default-{effort.preset}"
     trained = Step(
         "encode",
-        ("encode", DEFAULT, "--preset", "balanced", *effort.encode, "--keep-scenes", "kept"),
+        ("encode", DEFAULT, "--preset", effort.preset, *effort.encode, "--keep-scenes", "kept"),
         11,
         ("scene",),
         (f"{main}.kpc", f"{main}.kpck"),
@@ -128,7 +132,7 @@ def generated(effort: Effort) -> list[Step]:
         Step(
             f"curve-{preset}",
             ("curve", DEFAULT, "--preset", preset, "--minutes", minutes),
-            {"fast": 4, "balanced": 6}[preset],
+            {"draft": 3, "fast": 4, "balanced": 6}[preset],
             ("scene",),
         )
         for preset, minutes in effort.curves.items()
@@ -153,7 +157,7 @@ def generated(effort: Effort) -> list[Step]:
         Step("scaling", ("scaling", "--steps", scaling_steps, "--repeats", REPEATS), 6.5),
         long_clip,
         Step("groups", (*groups, "--test-views", "12"), 2.5, ("scene-long",)),
-        Step("step", ("step", DEFAULT, "--preset", "balanced", "--repeats", REPEATS), 1.5, ("scene",)),
+        Step("step", ("step", DEFAULT, "--preset", effort.preset, "--repeats", REPEATS), 1.5, ("scene",)),
         *_of_file("", f"{main}.kpc", "encode", effort.frames),
         Step("codec", ("codec", f"{coded}.kpck", "--dataset", DEFAULT), 4, ("scene", "encode-draft")),
         *_of_truth("", DEFAULT, f"{main}.kpc", ("scene", "encode")),

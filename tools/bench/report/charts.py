@@ -102,6 +102,7 @@ class Chart:
         log_x, log_y: whether an axis is logarithmic.
         lowest_y: what lies below is left out.
         marks: values of x with a vertical line.
+        limits: values of y with a horizontal line.
     """
 
     title: str
@@ -112,6 +113,7 @@ class Chart:
     log_y: bool = False
     lowest_y: float | None = None
     marks: Sequence[float] = ()
+    limits: Sequence[float] = ()
 
     @property
     def table(self) -> list[list[str]]:
@@ -140,13 +142,16 @@ class Chart:
                 _draw_series(axes, one, place, self, titles)
             for x in self.marks:
                 axes.axvline(x, color=DIM, linestyle="--", linewidth=0.8)
+            for y in self.limits:
+                axes.axhline(y, color=DIM, linestyle="--", linewidth=0.8)
             axes.set(xlabel=self.x_label, ylabel=self.y_label)
             if self.lowest_y is not None:
                 axes.set_ylim(bottom=self.lowest_y)
             for axis, is_log in ((axes.xaxis, self.log_x), (axes.yaxis, self.log_y)):
                 _ticks(axes, axis, is_log)
             figure.legend(loc="outside lower left", ncols=columns, fontsize=8, handlelength=1.6, columnspacing=1)
-            return _themed(figure, self.title, number, titles)
+            label = f"{self.title}: {self.y_label} against {self.x_label}"
+            return _themed(figure, label, number, titles)
 
 
 @dataclass(frozen=True)
@@ -198,7 +203,7 @@ class Bars:
             axes.xaxis.set_major_locator(MaxNLocator(5, steps=STEPS))
             axes.xaxis.set_major_formatter(FuncFormatter(_label))
             axes.spines["left"].set_visible(False)
-            return _themed(figure, self.title, number, titles)
+            return _themed(figure, f"{self.title}: {self.label}", number, titles)
 
 
 def _draw_series(axes: Axes, series: Series, place: int, chart: Chart, titles: dict[str, str]) -> None:
@@ -251,8 +256,15 @@ def _label(value: float, _: object) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}"
 
 
-def _themed(figure: Figure, title: str, number: int, titles: dict[str, str]) -> str:
-    """Return a figure as an SVG element with the page's colours, ids of its own, and titles by the ids of points."""
+def _themed(figure: Figure, label: str, number: int, titles: dict[str, str]) -> str:
+    """Return a figure as an SVG element with the page's colours, ids of its own, and titles by the ids of points.
+
+    Args:
+        figure: to be shown.
+        label: what it shows, for those who do not see it.
+        number: of the figure in its page.
+        titles: by id.
+    """
     written = io.StringIO()
     figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     root = ElementTree.fromstring(written.getvalue())
@@ -262,7 +274,7 @@ def _themed(figure: Figure, title: str, number: int, titles: dict[str, str]) -> 
                 parent.remove(child)
     for name in ("width", "height"):
         del root.attrib[name]
-    root.attrib |= {"role": "img", "aria-label": title}
+    root.attrib |= {"role": "img", "aria-label": label}
     for element in list(root.iter()):
         element.tag = element.tag.removeprefix(f"{{{SVG}}}")  # HTML knows the elements without their namespace
         if (address := element.attrib.pop(f"{{{XLINK}}}href", None)) is not None:
