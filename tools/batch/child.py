@@ -35,7 +35,7 @@ def _prepare(argv: list[str]) -> None:
     from kpc.encoder.cli.work_folder import make_work_folder
 
     options, *_ = parse(argv)
-    make_work_folder(options.work_dir)
+    make_work_folder(options.work_dir, options.cache)
     dataset = read_dataset(options)
     cli.print_json({"groups": len(plan_groups(options, dataset.clip)), "frames": dataset.clip.frame_count})
 

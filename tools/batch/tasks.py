@@ -4,7 +4,8 @@ A job is a task that encodes; a job in groups is a task that prepares, one that 
 joins them. How many groups there are is known once the clip has been looked at, so those tasks come later.
 """
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,6 +30,7 @@ class Task:
         before: keys of the tasks that must be done before; a JOIN joins their results, an ENCODE begins with what a
             PREPARE left in its work folder.
         resources: that it takes.
+        shares_source: whether other tasks have the same source, so that its decoded pixels are kept for them.
     """
 
     key: str
@@ -39,6 +41,7 @@ class Task:
     words: tuple[str, ...] = ()
     before: tuple[str, ...] = ()
     resources: Resources = field(default_factory=Resources)
+    shares_source: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,9 +65,10 @@ class Outcome:
     worker: str = ""
 
 
-def first_tasks(jobs: Iterable[Job]) -> list[Task]:
+def first_tasks(jobs: Sequence[Job]) -> list[Task]:
     """Return the tasks with which jobs begin: one for each."""
-    return [_prepare(job) if job.group else _encode(job) for job in jobs]
+    counts = Counter(job.source for job in jobs)
+    return [_prepare(job) if job.group else _encode(job, counts[job.source] > 1) for job in jobs]
 
 
 def tasks_of_groups(job: Job, count: int) -> list[Task]:
@@ -80,6 +84,7 @@ def tasks_of_groups(job: Job, count: int) -> list[Task]:
             words=(*job.options, f"--only={number}"),
             before=(prepared,),
             resources=job.resources,
+            shares_source=True,
         )
         for number in range(count)
     ]
@@ -99,13 +104,15 @@ def is_last(task: Task, jobs: Sequence[Job]) -> bool:
     return task.kind == (JOIN if job.group else ENCODE)
 
 
-def _encode(job: Job) -> Task:
-    return Task(_address(job, ENCODE), job.name, job.name, ENCODE, job.source, job.options, (), job.resources)
+def _encode(job: Job, shares_source: bool) -> Task:
+    key = _address(job, ENCODE)
+    return Task(key, job.name, job.name, ENCODE, job.source, job.options, (), job.resources, shares_source)
 
 
 def _prepare(job: Job) -> Task:
     key = _address(job, PREPARE)
-    return Task(key, f"{job.name} prepared", job.name, PREPARE, job.source, job.options, (), job.resources)
+    name = f"{job.name} prepared"
+    return Task(key, name, job.name, PREPARE, job.source, job.options, (), job.resources, shares_source=True)
 
 
 def _address(job: Job, part: str) -> str:

@@ -7,22 +7,18 @@ import contextlib
 import json
 import os
 import re
-import shutil
 import socket
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-import fsspec
-
 from kpc.format.common.errors import KpcError
-from kpc.tools.batch.addresses import source_address
+from kpc.tools.batch.scratch import Scratch, TaskError
 from kpc.tools.batch.store import LOG, RESULT, SCENE, WORK, Store
 from kpc.tools.batch.tasks import ENCODE, JOIN, PREPARE, Outcome, Task
 
@@ -53,10 +49,6 @@ class Place:
     scratch: str = ""
 
 
-class TaskError(KpcError):
-    """A task failed; the message says why."""
-
-
 def run(task: Task, place: Place, report: Report = lambda _: None) -> Outcome:
     """Do a task; return its outcome, of a failure, too.
 
@@ -67,8 +59,9 @@ def run(task: Task, place: Place, report: Report = lambda _: None) -> Outcome:
         store = Store(place.store)
         if store.exists(f"{task.key}/{RESULT}"):
             return Outcome(task.key, True, store.get_json(f"{task.key}/{RESULT}"))
-        with _scratch_folder(task, place) as folder:
-            figures = _run_in(folder, task, store, place, report)
+        scratch = Scratch(place.scratch)
+        with scratch.task_folder(task.key) as folder:
+            figures = _run_in(folder, task, store, scratch, report)
         store.put_json(figures, f"{task.key}/{RESULT}")
         if task.kind != PREPARE:
             store.remove(f"{task.key}/{WORK}")
@@ -77,7 +70,7 @@ def run(task: Task, place: Place, report: Report = lambda _: None) -> Outcome:
     return Outcome(task.key, True, figures, "", time.monotonic() - started, worker)
 
 
-def _run_in(folder: Path, task: Task, store: Store, place: Place, report: Report) -> dict[str, Any]:
+def _run_in(folder: Path, task: Task, store: Store, scratch: Scratch, report: Report) -> dict[str, Any]:
     """Do a task in an empty folder, and bring all but its figures to the store; return those."""
     work, scene = folder / WORK, folder / SCENE
     work.mkdir()
@@ -95,10 +88,12 @@ def _run_in(folder: Path, task: Task, store: Store, place: Place, report: Report
         for key in task.before:
             store.get_folder(f"{key}/{WORK}", work)
         resumes = store.get_folder(f"{task.key}/{WORK}", work)
-        source = _local_source(task.source, place)
+        source = scratch.source(task.source, folder)
         command = [source, "-o", str(scene), *task.words]
         if Path(source).is_dir():  # a file is coded anew, which needs no work folder
             command += [f"--work={work}", *["--resume"] * (resumes and task.kind == ENCODE)]
+            if task.shares_source and not any(word.startswith("--cache") for word in task.words):
+                command.append(f"--cache={scratch.pixels(task.source, folder)}")
         if task.kind == ENCODE:
             figures = _child(["kpenc", *command, "--json"], task, folder, store, report)
         else:
@@ -168,63 +163,6 @@ class Uploads:
                 if file.is_file() and self._sent.get(inner) != (state.st_mtime_ns, state.st_size):
                     self._store.put(file, f"{self._name}/{inner.as_posix()}")
                     self._sent[inner] = state.st_mtime_ns, state.st_size
-
-
-def _local_source(source: str, place: Place) -> str:
-    """Return the path of a source; fetch what lies at an address, once for all tasks of this machine.
-
-    Raises:
-        TaskError: this machine has no such path.
-    """
-    if "://" not in source:
-        if not Path(source).exists():
-            raise TaskError(f"{source}: is not on {socket.gethostname()}; share that folder, or name it by an address")
-        return source
-    target = _scratch(place) / "sources" / source_address(source) / source.rstrip("/").rsplit("/", 1)[-1]
-    if not target.exists():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-            fetched = Path(folder) / target.name
-            fs, root = fsspec.core.url_to_fs(source)
-            for name in sorted(fs.find(root)) or [root]:
-                inner = name.removeprefix(root).lstrip("/")
-                file = fetched / inner if inner else fetched
-                file.parent.mkdir(parents=True, exist_ok=True)
-                fs.get_file(name, str(file))
-            with contextlib.suppress(OSError):  # another task was faster
-                fetched.rename(target)
-    return str(target)
-
-
-def _scratch(place: Place) -> Path:
-    return Path(place.scratch or tempfile.gettempdir()) / "kpbatch"
-
-
-@contextlib.contextmanager
-def _scratch_folder(task: Task, place: Place) -> Iterator[Path]:
-    """Yield an empty folder, which is removed at the end; remove those that killed workers have left."""
-    base = _scratch(place)
-    base.mkdir(parents=True, exist_ok=True)
-    for left in base.glob("task-*-*"):
-        if not _is_alive(int(left.name.split("-")[1])):
-            shutil.rmtree(left, ignore_errors=True)
-    folder = base / f"task-{os.getpid()}-{task.key}"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def _progress(log: Path) -> dict[str, float]:

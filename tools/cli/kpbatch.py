@@ -61,6 +61,7 @@ def _run(
     """Do what is not done, and return the outcomes of jobs by their names."""
     from kpc.tools.batch import engine as scheduling  # Dask takes a second to load, which --help can do without
     from kpc.tools.batch.page import Page
+    from kpc.tools.batch.scratch import Scratch
     from kpc.tools.batch.working import Place
 
     by_name, ended = {job.name: job for job in jobs}, {}
@@ -93,6 +94,8 @@ def _run(
             elif event.task.kind == PREPARE:
                 engine.add(tasks_of_groups(by_name[event.task.job], event.outcome.figures["groups"]))
         page.redraw()
+    if not options.scheduler:
+        Scratch(options.scratch or "").tidy(kept_s=0)
     return ended
 
 
