@@ -9,7 +9,7 @@ import ctypes
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib.resources import files
@@ -26,8 +26,8 @@ PAGE = 1 << 16
 KEPT_BYTES = 64 << 20
 
 # Time that a call may take: this many seconds, and seconds for each number that it decodes. A slow machine needs about
-# a twentieth. Wasmtime counts in epochs of TICK_S, and an epoch in which the process hardly ran does not count: a busy
-# machine is no reason to refuse a file.
+# a twentieth. Wasmtime counts in epochs of TICK_S, which become longer until the process has run for BUSY_SHARE of
+# that: a busy machine is no reason to refuse a file.
 SECONDS, SECONDS_PER_NUMBER = 5.0, 1e-5
 TICK_S, BUSY_SHARE = 0.5, 0.5
 
@@ -165,16 +165,31 @@ def _engine() -> wasmtime.Engine:
     config.cache = True
     engine = wasmtime.Engine(config)
 
-    def count() -> None:
-        used_s = time.process_time()
-        while True:
-            time.sleep(TICK_S)
-            before_s, used_s = used_s, time.process_time()
-            if used_s - before_s > BUSY_SHARE * TICK_S:
-                engine.increment_epoch()
-
-    threading.Thread(target=count, name="deadline of the decoder core", daemon=True).start()
+    thread = threading.Thread(target=count_epochs, args=(engine.increment_epoch,), daemon=True)
+    thread.name = "deadline of the decoder core"
+    thread.start()
     return engine
+
+
+def count_epochs(
+    increment: Callable[[], object],
+    sleep: Callable[[float], None] = time.sleep,
+    process_time: Callable[[], float] = time.process_time,
+) -> None:
+    """Count epochs without end.
+
+    Args:
+        increment: begins the next epoch.
+        sleep: waits for so many seconds.
+        process_time: returns for how many seconds the process has run.
+    """
+    begun_s = process_time()
+    while True:
+        sleep(TICK_S)
+        now_s = process_time()
+        if now_s - begun_s > BUSY_SHARE * TICK_S:
+            begun_s = now_s
+            increment()
 
 
 @cache

@@ -133,9 +133,24 @@ def test_what_does_not_end_is_stopped(monkeypatch):
     monkeypatch.setattr(core, "_idle", [])
     monkeypatch.setattr(core, "_compiled", lambda _: module)
     monkeypatch.setattr(core, "SECONDS", 0.0)
+    monkeypatch.setattr(core, "TICK_S", 0.05)
     with pytest.raises(FormatError, match="takes far longer than its size allows"):
         decoding.decode_motion(bytes(16), 100)
     assert core._idle == []
+
+
+def test_epochs_are_longer_on_a_busy_machine():
+    """The process runs for a fifth of each tick, so that an epoch takes three."""
+    epochs, slept = [], []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        if len(slept) > 30:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        core.count_epochs(lambda: epochs.append(len(slept)), sleep, lambda: core.TICK_S * len(slept) / 5)
+    assert epochs == list(range(3, 31, 3))
 
 
 @pytest.mark.parametrize("codec", [Codec.RAW, Codec.PREDICTIVE, Codec.TRANSFORM])
