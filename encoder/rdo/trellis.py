@@ -344,7 +344,8 @@ def _search_row(
     cost, before = np.full(STATES, np.inf), np.full(STATES, np.inf)
     cost[0] = 0
     for s in range(STATES):
-        V[:2, s], R[:2, s] = prediction.v[y % 3][:2], prediction.r[y % 3][:2]
+        for x in range(2):  # arrays assigned to slices would have their message about shapes compiled
+            V[x, s], R[x, s] = prediction.v[y % 3][x], prediction.r[y % 3][x]
     for x in range(coded.shape[1]):
         X = x + 2
         before, cost = cost, before

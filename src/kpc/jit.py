@@ -81,10 +81,12 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        # No kernel is a callback of C, whose wrapper would be an eighth of the work of compiling.
+        wanted = {"nogil": True, "no_cfunc_wrapper": True, **options}
         try:
-            return njit(cache=True, nogil=True, **options)(function)
+            return njit(cache=True, **wanted)(function)
         except RuntimeError:  # numba found no writable cache folder
-            return njit(nogil=True, **options)(function)
+            return njit(**wanted)(function)
 
     return decorate
 

@@ -65,4 +65,5 @@ def scatter_features(planes, g_theta, g_motion, g_points, points, times, g):
                 scatter_motion(g_motion[worker], buffers, 0)
             if wants_points:
                 undisplace_gradient(planes.motion, buffers, 0)
-                g_points[i] = buffers.g_point
+                for axis in range(4):  # an array assigned to a row would have its message about shapes compiled
+                    g_points[i, axis] = buffers.g_point[axis]
