@@ -5,5 +5,8 @@ set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
 
 install_kpc encoder,test
+# The package is compiled to bytecode once, not by each of the many processes that tests start.
+unset PYTHONDONTWRITEBYTECODE
+.venv/bin/python -m compileall -q src encoder format player tools
 has_opengl || echo "tests that need OpenGL are skipped" >&2
 exec .venv/bin/python -m pytest -ra -n auto --maxprocesses 4 --dist worksteal "$@"
