@@ -1,4 +1,6 @@
 import json
+import operator
+import os
 import pickle
 import shlex
 from collections.abc import Callable
@@ -230,7 +232,11 @@ def test_every_ablation_affects_some_config() -> None:
     assert ABLATIONS["baseline"](plain) is plain
 
 
-def test_player_measures_every_quality(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_jobs_run_in_a_process_of_their_own() -> None:
+    assert harness.isolated(operator.call, os.getpid) not in (0, os.getpid())
+
+
+def test_player_measures_every_quality(here: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gl.context()
     moving, still = tiny_file(tmp_path / "moving.kpc", True), tiny_file(tmp_path / "still.kpc", False)
     out = tmp_path / "out.json"
