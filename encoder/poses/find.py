@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from kpc.encoder.datasets.capture import first_names
+from kpc.encoder.poses.clocks import UNKNOWN, Clock
 from kpc.encoder.poses.footage import Footage, find_footage
 from kpc.encoder.poses.given_clocks import read_clocks
 from kpc.encoder.poses.instants import Picture, grey_of, moving_pictures, still_pictures
 from kpc.encoder.poses.orientation import extent
 from kpc.encoder.poses.structure import MANY, Pairing, PlacedView, Structure, oriented, reconstruct
 from kpc.encoder.poses.survey import Survey, frame_count, greys, survey
-from kpc.encoder.poses.sync import UNKNOWN, Clock, synchronise
+from kpc.encoder.poses.sync import SURE, clocks_by_motion, clocks_by_sound, wants_motion
 from kpc.encoder.poses.wishes import Wishes
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info, read_image
@@ -115,13 +116,17 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
             "more; film with more cameras, or walk around with one"
         )
     names = [one.name for one in footage]
+    lenses = _lenses([seen.median.shape for seen in surveys])
+    still: Structure | None = None
     if isinstance(wishes.sync, str):
-        clocks = synchronise(footage, surveys, wishes.sync)
-        _warn_of_unknown(root, names, clocks)
+        clocks = clocks_by_sound(footage, wishes.sync)
+        if wants_motion(footage, clocks, wishes.sync):
+            still = reconstruct(still_pictures(surveys), names, lenses, ATTEMPTS[0][0])
+            clocks = clocks_by_motion(footage, surveys, clocks, still.views)
+        _warn_of_clocks(root, names, clocks)
     else:
         clocks = read_clocks(wishes.sync, names)
     best: Structure | None = None
-    lenses = _lenses([seen.median.shape for seen in surveys])
     for features, instants in ATTEMPTS:
         pictures = [*still_pictures(surveys), *moving_pictures(footage, surveys, clocks, instants)]
         structure = reconstruct(sorted(pictures, key=lambda picture: picture.view), names, lenses, features)
@@ -134,19 +139,29 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
             file=sys.stderr,
         )
     assert best is not None
+    if still is not None and len(still.views) > len(best.views):
+        best = still
     motion = tuple(seen.motion for seen in surveys)
     return Found("still rig", footage, tuple(clocks), tuple(names), best, False, motion)
 
 
-def _warn_of_unknown(root: Path, names: Sequence[str], clocks: Sequence[Clock]) -> None:
-    """Name the cameras whose clocks could not be found, if others' could."""
+def _warn_of_clocks(root: Path, names: Sequence[str], clocks: Sequence[Clock]) -> None:
+    """Name the cameras whose clocks could not be found, if others' could, and those that are unsure."""
+    advice = "film a clap that all cameras see and hear, or give their offsets with --sync offsets.json"
     unknown = [name for name, clock in zip(names, clocks, strict=True) if clock.method == "none"]
     if unknown and len(unknown) < len(names):
         print(
-            f"{root}: warning: the clocks of {first_names(unknown)} could not be found and are left as they are; film "
-            "a clap that all cameras see and hear, or give their offsets with --sync offsets.json",
+            f"{root}: warning: the clocks of {first_names(unknown)} could not be found and are left as they are; "
+            f"{advice}",
             file=sys.stderr,
         )
+    unsure = [
+        f"{name} ({clock.confidence:.0%})"
+        for name, clock in zip(names, clocks, strict=True)
+        if clock.method == "motion" and clock.confidence < SURE
+    ]
+    if unsure:
+        print(f"{root}: warning: the clocks of {first_names(unsure)} are unsure; {advice}", file=sys.stderr)
 
 
 def _find_moving_camera(root: Path, footage: Footage) -> Found:

@@ -16,7 +16,7 @@ from typing import Any
 from kpc.encoder.datasets.capture import first_names, printable
 from kpc.encoder.datasets.layouts.documents import MAX_BYTES, read_json
 from kpc.encoder.datasets.layouts.transforms import GREATEST_RATE, LONGEST_OFFSET_S
-from kpc.encoder.poses.sync import UNKNOWN, Clock
+from kpc.encoder.poses.clocks import UNKNOWN, Clock
 from kpc.format.common.errors import DatasetError
 
 KEYS = ("offset_s", "rate")

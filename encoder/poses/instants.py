@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpc.encoder.datasets.video import read_video
+from kpc.encoder.poses.clocks import Clock
 from kpc.encoder.poses.footage import Footage
 from kpc.encoder.poses.survey import Survey
-from kpc.encoder.poses.sync import Clock
 from kpc.format.common.images import luma, read_image
 
 # Frames of two cameras show the same instant if they are no further apart than this share of a frame.

@@ -13,6 +13,8 @@ from kpc.format.common.images import luma, read_image
 SPREAD_FRAMES = 15
 # Motion is measured on squares of so many pixels, so that noise does not count.
 SQUARE = 4
+# Where things move is kept on about so many squares across, of at most so many frames.
+ACROSS, LONGEST = 96, 1500
 # A pixel is textured if its neighbours differ by at least so many levels of 255, and it stays if it differs from the
 # median picture by no more than so many in half of the frames.
 TEXTURE, STAYS = 12.0, 8.0
@@ -28,12 +30,16 @@ class Survey:
 
     Attributes:
         motion: (N,) float64, mean change of the picture before each frame, in levels of 255; 0 before the first.
+        changes: (F, h, w) float16, mean change before each frame, of squares of `square` pixels; F = min(N, LONGEST).
+        square: side of the squares of `changes` in pixels.
         median: (H, W) uint8, the median over the spread frames.
         moving: (H, W) bool, pixels that leave their median in some frame.
         still_share: share of the textured pixels that stay; NaN without texture, or with one frame.
     """
 
     motion: np.ndarray
+    changes: np.ndarray
+    square: int
     median: np.ndarray
     moving: np.ndarray
     still_share: float
@@ -62,20 +68,24 @@ def survey(footage: Footage) -> Survey:
     """Read all frames of a camera once."""
     count = frame_count(footage)
     wanted = set(np.linspace(0, count - 1, min(SPREAD_FRAMES, count)).round().astype(int).tolist())
-    motion, spread, before = np.zeros(count), [], None
+    motion, changes, spread, before, side = np.zeros(count), [], [], None, 1
     for number, grey in enumerate(greys(footage)):
         if number in wanted:
             spread.append(grey.round().astype(np.uint8))
-        small = _squares(grey)
-        if before is not None:
-            motion[number] = np.abs(small - before).mean()
+        small = _squares(grey, SQUARE)
+        change = np.zeros_like(small) if before is None else np.abs(small - before)
+        motion[number] = change.mean()
+        if number < LONGEST:
+            side = -(-small.shape[1] // ACROSS)
+            changes.append(_squares(change, side).astype(np.float16))
         before = small
     frames = np.stack(spread)
     median = np.median(frames, axis=0).astype(np.float32)
     deviations = np.abs(frames - median)
     usual = float(np.median(deviations)) / 0.6745  # standard deviation of Gaussian noise
     moving = _grown(deviations.max(0) > max(MOVES, MOVES_BY_NOISE * usual))
-    return Survey(motion, median.astype(np.uint8), moving, _still_share(median, deviations))
+    where = np.stack(changes)
+    return Survey(motion, where, SQUARE * side, median.astype(np.uint8), moving, _still_share(median, deviations))
 
 
 def _still_share(median: np.ndarray, deviations: np.ndarray) -> float:
@@ -86,11 +96,10 @@ def _still_share(median: np.ndarray, deviations: np.ndarray) -> float:
     return float((np.median(deviations, axis=0)[:-1, :-1][textured] <= STAYS).mean())
 
 
-def _squares(grey: np.ndarray) -> np.ndarray:
-    """Average squares of SQUARE x SQUARE pixels; the remainder is cut off."""
-    rows, columns = (size // SQUARE for size in grey.shape)
-    cut = grey[: rows * SQUARE, : columns * SQUARE]
-    return cut.reshape(rows, SQUARE, columns, SQUARE).mean((1, 3))
+def _squares(grey: np.ndarray, side: int) -> np.ndarray:
+    """Average squares of so many pixels a side; the remainder is cut off."""
+    rows, columns = (size // side for size in grey.shape)
+    return grey[: rows * side, : columns * side].reshape(rows, side, columns, side).mean((1, 3))
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:

@@ -2,65 +2,42 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize
 
 from kpc.encoder.datasets.sound_tracks import clarity, has_sound, read_samples
+from kpc.encoder.poses.clocks import UNKNOWN, Clock
+from kpc.encoder.poses.epipolar_motion import FRAMES_AS_ONE, directions, sheaf_signal, sheaves
 from kpc.encoder.poses.footage import Footage
-from kpc.encoder.poses.motion_sync import PairOffset, align_motion
+from kpc.encoder.poses.joint_offsets import joint_offsets
+from kpc.encoder.poses.motion_sync import (
+    STEPS_PER_FRAME,
+    TREND_S,
+    Evidence,
+    curve_evidence,
+    evidence,
+    sampled,
+    together,
+)
 from kpc.encoder.poses.sound_sync import align_sound
-from kpc.encoder.poses.survey import Survey
+from kpc.encoder.poses.structure import PlacedView
+from kpc.encoder.poses.survey import LONGEST, Survey
 from kpc.format.common.progress import progress
 from kpc.format.scene.sound import SAMPLE_RATE
 
-# Alignments with less confidence are not used: shares of the pieces of sound, and of the pairs of curves, that agree.
-LEAST_AGREEING, LEAST_CONFIDENCE = 0.6, 0.4
-# Least correlation of two curves of motion, and least margin to any other offset, to be used.
-LEAST_CORRELATION, LEAST_MARGIN = 0.5, 0.02
+# Alignments of sound are used if at least this share of its pieces agrees.
+LEAST_AGREEING = 0.6
+# Offsets from what moves are used if they are right with at least this probability, and are sure with the other.
+LEAST_CONFIDENCE, SURE = 0.5, 0.9
 # Seconds of sound that are compared: of a longer recording, the beginning.
 LONGEST_S = 600.0
 
 
-@dataclass(frozen=True)
-class Clock:
-    """The clock of a camera: time of the clip = offset_s + rate * time of its file.
-
-    Attributes:
-        offset_s: seconds.
-        rate: 1 without drift.
-        method: "audio", "motion", "given", "reference" or "none".
-        confidence: 0 to 1; NaN if nothing was measured.
-    """
-
-    offset_s: float
-    rate: float
-    method: str
-    confidence: float
-
-
-UNKNOWN = Clock(0.0, 1.0, "none", float("nan"))
-
-
-def synchronise(footage: Sequence[Footage], surveys: Sequence[Survey], mode: str) -> list[Clock]:
-    """Find the clock of each camera; one that cannot be found keeps the time of its file.
-
-    Args:
-        mode: one of `wishes.SYNC_MODES`.
-    """
-    clocks: list[Clock] = [UNKNOWN] * len(footage)
-    if mode == "none" or len(footage) < 2 or any(one.video is None for one in footage):
-        return clocks
-    if mode in ("auto", "audio"):
-        clocks = _by_sound(footage)
-    if mode in ("auto", "motion") and any(clock.method == "none" for clock in clocks):
-        clocks = _by_motion(footage, surveys, clocks)
-    return clocks
-
-
-def _by_sound(footage: Sequence[Footage]) -> list[Clock]:
+def clocks_by_sound(footage: Sequence[Footage], mode: str) -> list[Clock]:
+    """Find the clock of each camera that has sound, if `mode` allows, one of `wishes.SYNC_MODES`."""
     clocks = [UNKNOWN] * len(footage)
+    if mode not in ("auto", "audio") or not _are_videos(footage):
+        return clocks
     tracks = {}
     for number, one in enumerate(footage):
         if has_sound(one.files[0]):
@@ -80,69 +57,59 @@ def _by_sound(footage: Sequence[Footage]) -> list[Clock]:
     return clocks if any(clock.method == "audio" for clock in clocks) else [UNKNOWN] * len(footage)
 
 
-def _by_motion(footage: Sequence[Footage], surveys: Sequence[Survey], clocks: list[Clock]) -> list[Clock]:
-    """Find the clocks that are unknown from the offsets between all pairs, most of which are to agree."""
+def wants_motion(footage: Sequence[Footage], clocks: Sequence[Clock], mode: str) -> bool:
+    """Return whether clocks are missing that are to be found by what moves."""
+    return mode in ("auto", "motion") and _are_videos(footage) and any(clock.method == "none" for clock in clocks)
+
+
+def _are_videos(footage: Sequence[Footage]) -> bool:
+    return len(footage) > 1 and all(one.video is not None for one in footage)
+
+
+def clocks_by_motion(
+    footage: Sequence[Footage], surveys: Sequence[Survey], clocks: Sequence[Clock], views: dict[int, PlacedView]
+) -> list[Clock]:
+    """Find the clocks that are unknown, by what moves in all pairs of cameras together.
+
+    Args:
+        footage, surveys, clocks: of each camera.
+        views: places of cameras, as far as known: two of these are compared along epipolar lines.
+    """
     known = {number for number, clock in enumerate(clocks) if clock.method != "none"}
     times = [
         clock.offset_s + clock.rate * one.video.times for clock, one in zip(clocks, footage, strict=True) if one.video
     ]
-    rate = [1 / float(np.median(np.diff(t))) if len(t) > 1 else 0.0 for t in times]
-    pairs: dict[tuple[int, int], PairOffset] = {}
-    for i, j in itertools.combinations(range(len(footage)), 2):
-        if i in known and j in known:
-            continue
-        found = align_motion(times[i], surveys[i].motion, times[j], surveys[j].motion, max(rate[i], rate[j]))
-        if found is not None and found.correlation >= LEAST_CORRELATION and found.margin >= LEAST_MARGIN:
-            pairs[i, j] = found
-    start = _spanning_offsets(pairs, known)
-    if not known and not start:
-        return clocks
-    half_frame = 0.5 / max(rate)
-    offsets = _agreed_offsets(pairs, start, known, half_frame)
+    intervals = [float(np.median(np.diff(t))) for t in times if len(t) > 1]
+    if not intervals:
+        return list(clocks)
+    step_s = min(intervals) / STEPS_PER_FRAME
+    pairs = _pairs(times, surveys, known, views, step_s)
     result = list(clocks)
-    for number in offsets:
-        if number in known:
-            continue
-        own = {pair: found for pair, found in pairs.items() if number in pair and all(n in offsets for n in pair)}
-        agreeing = sum(
-            found.margin for (i, j), found in own.items() if abs(offsets[j] - offsets[i] - found.offset_s) <= half_frame
-        )
-        share = agreeing / sum(found.margin for found in own.values()) if own else 0.0
-        if share >= LEAST_CONFIDENCE:
-            result[number] = Clock(offsets[number], 1.0, "motion", share)
+    for number, found in joint_offsets(pairs, known).items():
+        if number not in known and found.confidence >= LEAST_CONFIDENCE:
+            result[number] = Clock(found.steps * step_s, 1.0, "motion", found.confidence)
     return result
 
 
-def _spanning_offsets(pairs: dict[tuple[int, int], PairOffset], known: set[int]) -> dict[int, float]:
-    """Return offsets to begin with, along the pairs of the widest margin from what is known, or the best pair."""
-    if not pairs:
-        return {}
-    ranked = sorted(pairs, key=lambda pair: -pairs[pair].margin)
-    offsets = dict.fromkeys(known or {ranked[0][0]}, 0.0)
-    while True:
-        pair = next((pair for pair in ranked if (pair[0] in offsets) != (pair[1] in offsets)), None)
-        if pair is None:
-            return offsets
-        i, j = pair
-        if i in offsets:
-            offsets[j] = offsets[i] + pairs[pair].offset_s
-        else:
-            offsets[i] = offsets[j] - pairs[pair].offset_s
-
-
-def _agreed_offsets(
-    pairs: dict[tuple[int, int], PairOffset], start: dict[int, float], known: set[int], scale_s: float
-) -> dict[int, float]:
-    """Return the offsets that most pairs agree with: a robust least-squares fit."""
-    fixed = known or {min(start)}
-    free = [number for number in start if number not in fixed]
-    used = [(pair, found) for pair, found in pairs.items() if pair[0] in start and pair[1] in start]
-    if not free or not used:
-        return start
-
-    def residuals(values: np.ndarray) -> np.ndarray:
-        now = start | dict(zip(free, values.tolist(), strict=True))
-        return np.array([found.margin**0.5 * (now[j] - now[i] - found.offset_s) for (i, j), found in used])
-
-    fit = optimize.least_squares(residuals, [start[n] for n in free], loss="soft_l1", f_scale=0.2 * scale_s)
-    return start | dict(zip(free, fit.x.tolist(), strict=True))
+def _pairs(
+    times: list[np.ndarray], surveys: Sequence[Survey], known: set[int], views: dict[int, PlacedView], step_s: float
+) -> dict[tuple[int, int], Evidence]:
+    """Return what each two cameras say of the offset between them."""
+    curves = [sampled(t, seen.motion[:, None], step_s, TREND_S) for t, seen in zip(times, surveys, strict=True)]
+    rays = {number: directions(view, surveys[number]) for number, view in views.items()}
+    found = {}
+    numbers = [pair for pair in itertools.combinations(range(len(times)), 2) if not known.issuperset(pair)]
+    for i, j in progress(numbers, "comparing motion", unit="pair"):
+        parts = []
+        lines = sheaves(views[i], views[j], (rays[i], rays[j])) if i in views and j in views else None
+        if lines is not None:
+            one, two = (sheaf_signal(times[n], surveys[n], k, step_s) for n, k in zip((i, j), lines, strict=True))
+            if one is not None and two is not None:
+                parts.append(evidence(one, two, frames_as_one=FRAMES_AS_ONE))
+        one, two = curves[i], curves[j]
+        if (not parts or max(len(times[i]), len(times[j])) > LONGEST) and one is not None and two is not None:
+            parts.append(curve_evidence(one, two, step_s))
+        said = [part for part in parts if part is not None]
+        if said:
+            found[i, j] = together(said)
+    return found

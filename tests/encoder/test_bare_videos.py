@@ -62,7 +62,7 @@ def test_all_cameras_of_a_still_rig_are_placed(document):
 
 def test_videos_are_brought_in_step_by_what_moves(document):
     offsets = np.array([frame.get("time_offset", 0.0) for frame in document["frames"]])
-    assert offsets - offsets[0] == pytest.approx(np.array(LATE) / FPS, abs=0.5 / FPS)
+    assert offsets - offsets[0] == pytest.approx(np.array(LATE) / FPS, abs=0.2 / FPS)
 
 
 def test_a_page_shows_the_cameras(room, document):

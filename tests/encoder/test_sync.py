@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 
 from kpc.format.common.errors import DatasetError
+from textured_room import rig
 
 sound_sync = pytest.importorskip("kpc.encoder.poses.sound_sync", reason="needs scipy")
 motion_sync = pytest.importorskip("kpc.encoder.poses.motion_sync", reason="needs scipy")
 
+joint_offsets = pytest.importorskip("kpc.encoder.poses.joint_offsets", reason="needs scipy")
+epipolar_motion = pytest.importorskip("kpc.encoder.poses.epipolar_motion", reason="needs scipy")
+structure = pytest.importorskip("kpc.encoder.poses.structure")
+survey = pytest.importorskip("kpc.encoder.poses.survey")
 given_clocks = pytest.importorskip("kpc.encoder.poses.given_clocks", reason="needs scipy")
 
 RATE = 48000
@@ -69,32 +74,94 @@ def curve(times: np.ndarray, seed: int) -> np.ndarray:
     return np.maximum(level, 0.1) * (1 + 0.1 * np.random.default_rng(seed).standard_normal(len(times)))
 
 
+STEP_S = 1 / 60
+
+
+def evidence_of(one: np.ndarray, late: float, fps: float, count: int = 90) -> motion_sync.Evidence:
+    two = np.arange(count) / fps
+    signals = [
+        motion_sync.sampled(times, motion[:, None], STEP_S, motion_sync.TREND_S)
+        for times, motion in ((one, curve(one, 1)), (two, curve(two + late, 2)))
+    ]
+    return motion_sync.curve_evidence(*signals, STEP_S)
+
+
 @pytest.mark.parametrize("late, fps", [(0.0, 30.0), (0.717, 30.0), (1.2, 25.0)])
 def test_motion_gives_the_offset_within_half_a_frame(late, fps):
-    one, two = np.arange(100) / 30, np.arange(90) / fps
-    found = motion_sync.align_motion(one, curve(one, 1), two, curve(two + late, 2), 30.0)
-    assert found is not None
-    assert found.offset_s == pytest.approx(late, abs=0.5 / 30)
-    assert found.correlation > 0.8 and found.margin > 0.02
+    found = joint_offsets.joint_offsets({(0, 1): evidence_of(np.arange(100) / 30, late, fps)}, set())
+    assert found[0].steps == 0
+    assert found[1].steps * STEP_S == pytest.approx(late, abs=0.5 / 30)
+    assert found[1].confidence > 0.5
 
 
 def test_what_does_not_move_is_not_aligned():
     times = np.arange(60) / 30
-    assert motion_sync.align_motion(times, np.zeros(60), times, curve(times, 1), 30.0) is None
-    assert motion_sync.align_motion(times[:5], np.ones(5), times, curve(times, 1), 30.0) is None
+    still, moving = (motion_sync.sampled(times, m[:, None], STEP_S) for m in (np.zeros(60), curve(times, 1)))
+    assert motion_sync.curve_evidence(still, moving, STEP_S) is None
+    assert motion_sync.sampled(times[:3], np.ones((3, 1)), STEP_S) is None
+
+
+def all_pairs(curves: list[np.ndarray]) -> dict[tuple[int, int], motion_sync.Evidence]:
+    signals = [motion_sync.sampled(np.arange(len(c)) / 30, c[:, None], STEP_S) for c in curves]
+    return {
+        (i, j): motion_sync.curve_evidence(signals[i], signals[j], STEP_S)
+        for i, j in itertools.combinations(range(len(curves)), 2)
+    }
+
+
+def test_unlike_motion_gives_no_confident_offset():
+    rng = np.random.default_rng(3)
+    for count in (3, 6):
+        found = joint_offsets.joint_offsets(all_pairs([np.exp(rng.standard_normal(80)) for _ in range(count)]), set())
+        assert max(offset.confidence for offset in found.values()) < 0.5
+
+
+def test_motion_that_repeats_itself_gives_no_sure_offset():
+    rng, found = np.random.default_rng(4), []
+    for late in ((0, 3, 9), (0, 16, 5), (0, 11, 20)):
+        curves = [np.exp(np.sin(2 * np.pi * (np.arange(90) + by) / 14) + 0.2 * rng.standard_normal(90)) for by in late]
+        found += joint_offsets.joint_offsets(all_pairs(curves), set()).values()
+    assert max(offset.confidence for offset in found) < 0.9
 
 
 def test_a_wrong_pair_does_not_move_the_others():
-    sync = pytest.importorskip("kpc.encoder.poses.sync")
-    true = [0.0, 0.4, -0.3, 1.1]
-    pairs = {
-        (i, j): motion_sync.PairOffset(true[j] - true[i] + 0.002 * i, 0.9, 0.2)
-        for i, j in itertools.combinations(range(4), 2)
-    }
-    pairs[2, 3] = motion_sync.PairOffset(-2.0, 0.9, 0.15)
-    start = sync._spanning_offsets(pairs, set())
-    found = sync._agreed_offsets(pairs, start, set(), 0.5 / 30)
-    assert [found[number] - found[0] for number in range(4)] == pytest.approx(true, abs=0.01)
+    late = [0, 24, -18, 30]  # steps
+    times = np.arange(100) / 30
+    pairs = {}
+    for i, j in itertools.combinations(range(4), 2):
+        one, two = (
+            motion_sync.sampled(times, curve(times + late[n] * STEP_S, n)[:, None], STEP_S, motion_sync.TREND_S)
+            for n in (i, j)
+        )
+        pairs[i, j] = motion_sync.curve_evidence(one, two, STEP_S)
+    pairs[2, 3] = pairs[2, 3].shifted(-40)
+    found = joint_offsets.joint_offsets(pairs, set())
+    assert [found[number].steps for number in range(4)] == pytest.approx(late, abs=0.5 * motion_sync.STEPS_PER_FRAME)
+    known = joint_offsets.joint_offsets(pairs, {1})
+    assert known[1].steps == 0
+    assert known[0].steps == pytest.approx(-24, abs=0.5 * motion_sync.STEPS_PER_FRAME)
+
+
+def test_a_point_lies_on_the_same_sheaf_of_epipolar_lines_in_both_cameras():
+    side, square, shape = 320, 4, (80, 80)
+    poses = [camera.pose for camera in rig(3)][:2]
+    views = [structure.PlacedView(pose, (300.0, 300.0, side / 2, side / 2), (0.0,) * 4, 0, 0.0) for pose in poses]
+    changes = np.zeros((4, *shape), np.float16)
+    seen = survey.Survey(
+        np.zeros(4), changes, square, np.zeros((side, side), np.uint8), np.zeros((side, side), bool), 1
+    )
+    first, second = epipolar_motion.sheaves(*views, tuple(epipolar_motion.directions(view, seen) for view in views))
+    compared = apart = 0
+    for point in np.random.default_rng(0).uniform((-0.7, -0.7, 0), (0.7, 0.7, 1.3), (200, 3)):
+        found = []
+        for pose, sheaf in zip(poses, (first, second), strict=True):
+            at = np.linalg.inv(pose) @ [*point, 1]
+            x, y = side / 2 - 300 * at[0] / at[2], side / 2 + 300 * at[1] / at[2]
+            found.append(sheaf.reshape(shape)[int(y) // square, int(x) // square])
+        if min(found) >= 0:
+            compared, apart = compared + 1, apart + abs(found[0] - found[1])
+    assert compared > 100
+    assert apart / compared < 0.5  # a sheaf is three squares high: half of a square is lost in each camera
 
 
 NAMES = ("cam00", "cam01", "cam02")
