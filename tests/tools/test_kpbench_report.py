@@ -213,6 +213,23 @@ def test_costs_are_drawn_by_axis_with_their_exponents() -> None:
     assert memory.series[0].points[0] == Point(2, 2.0, "2")
 
 
+def test_sweeps_show_each_implementation_with_its_bound_and_what_is_admitted() -> None:
+    points = [
+        {"value": value, "errors": {"numpy": value / 1e6, "glsl": error}}
+        for value, error in ((0, 1), (1, 0), (9, None), (99, 0.5))
+    ]
+    settings = {"axis": "edge", "error": "picture", "bound": 1 / 255, "admitted": [0, 50]}
+    (chart,) = [
+        c for c in trades.precision([record("stability", "box", settings=settings, points=points)]) if c.table[1:]
+    ]
+    assert isinstance(chart, Chart) and chart.title == "box: edge" and list(chart.marks) == [50]
+    assert [(one.name, [point.x for point in one.points]) for one in chart.series] == [
+        ("numpy", [1, 9, 99]),
+        ("glsl", [99]),
+    ]
+    assert chart.limits == (1 / 255,) and "numpy, 9" in chart.svg(0)
+
+
 def test_points_below_the_axes_are_not_drawn() -> None:
     chart = Chart("t", "x", "y", [Series("s", [Point(1, 1, "low"), Point(2, 9, "high")])], lowest_y=5)
     drawn = chart.svg(0)

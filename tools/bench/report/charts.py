@@ -28,6 +28,8 @@ MARKERS = "os^Dv<>Ph"
 WIDTH, HEIGHT, BAR_HEIGHT, LEGEND_ROW = 4.0, 2.9, 0.21, 0.19  # inches
 LEGEND_COLUMN_LETTERS = 27  # names of series longer than this take the whole width
 STEPS = (1, 2, 2.5, 5, 10)  # between two ticks of a linear axis, times a power of ten
+MOST_DECADES = 7  # labels of an axis that shows whole decades only
+SUPERSCRIPTS = str.maketrans("-0123456789", "\u207b\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079")
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "kpc",
@@ -247,13 +249,18 @@ def _ticks(axes: Axes, axis: Any, is_log: bool) -> None:
     subs: tuple[float, ...] = (1, 2, 5) if decades < 40 else (1, 3) if decades < 1000 else (1,)
     if decades < 4:
         subs = (1, 1.5, 2, 3, 4, 5, 6, 8)
-    axis.set_major_locator(LogLocator(subs=subs, numticks=12))
+    axis.set_major_locator(LogLocator(subs=subs, numticks=12 if len(subs) > 1 else MOST_DECADES))
     axis.set_major_formatter(FuncFormatter(_label))
     axis.set_minor_formatter(NullFormatter())
 
 
-def _label(value: float, _: object) -> str:
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}"
+def _label(value: float, position: object) -> str:
+    """Return the text of a tick: a power of ten where digits would be many."""
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}"
+    mantissa, _, exponent = f"{value:.3e}".partition("e")
+    power = "10" + str(int(exponent)).translate(SUPERSCRIPTS)
+    return power if float(mantissa) == 1 else f"{float(mantissa):g}\u00b7{power}"
 
 
 def _themed(figure: Figure, label: str, number: int, titles: dict[str, str]) -> str:

@@ -282,9 +282,30 @@ def precision(records: Sequence[Record]) -> list[AnyChart]:
         )
         for record in coded
     ]
-    if not any(one.points for one in series):
-        return []
-    return [Chart("Bits of a parameter", "bits per parameter", "PSNR lost by coding, dB", series, log_y=True)]
+    bits = Chart("Bits of a parameter", "bits per parameter", "PSNR lost by coding, dB", series, log_y=True)
+    return [bits, *(_swept(record) for record in records if record["kind"] == "stability")]
+
+
+def _swept(record: Record) -> Chart:
+    """Return the chart of the errors of a stage's implementations over what is swept; errors of 0 have no logarithm."""
+    settings = record["settings"]
+    names = dict.fromkeys(name for point in record["points"] for name in point["errors"])
+    series = [
+        Series(
+            name,
+            [
+                Point(point["value"], point["errors"][name], f"{point['value']:g}")
+                for point in record["points"]
+                if point["value"] > 0 and point["errors"].get(name)
+            ],
+        )
+        for name in names
+    ]
+    values = [point.x for one in series for point in one.points]
+    ends = [end for end in settings["admitted"] if end and values and min(values) <= end <= max(values)]
+    label = f"largest error, {settings['error']}"
+    title = f"{record['name']}: {settings['axis']}"
+    return Chart(title, settings["axis"], label, series, log_y=True, marks=ends, limits=(settings["bound"],))
 
 
 def costs(records: Sequence[Record]) -> list[AnyChart]:
@@ -357,7 +378,7 @@ SECTIONS = (
         "precision",
         "Precision and error",
         "How much PSNR is lost when each number takes fewer bits, and how large the error of each stage of the "
-        "arithmetic is.",
+        "arithmetic is, against float64. Dashed lines are the bound of the error and the ends of what the code admits.",
         ("codec", "stability"),
         precision,
     ),
