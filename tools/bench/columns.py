@@ -317,6 +317,15 @@ COLUMNS: dict[str, list[Column]] = {
         *_of_parts("FLIP", "flip", "{:.3f}"),
         *_of_parts("flicker", "flicker", "{:.2f}", 1 / 255),
     ],
+    "ceiling": [
+        ("dataset", _name),
+        ("preset", _setting("preset")),
+        ("pictures", number("pictures", "{:.0f}")),
+        ("moves", number("moving_share", "{:.0%}")),
+        *_of_parts("PSNR", "psnr", "{:.2f}"),
+        *_of_parts("SSIM", "ssim", "{:.3f}"),
+        *_of_parts("FLIP", "flip", "{:.3f}"),
+    ],
     "decode": [
         ("scene", _name),
         ("segments", number("segments", "{:.0f}")),
@@ -363,6 +372,7 @@ PRINTED: dict[str, tuple[str, ...]] = {
     "groups": ("dataset", "groups", "file KB", "PSNR dB", "encoded in s", "peak MB, all"),
     "entropy": ("scene", "variant", "planes KB", "decoding ms", "file KB", "reading ms"),
     "quality": ("scene", "pictures", "PSNR", "moving PSNR", "FLIP", "flicker"),
+    "ceiling": ("dataset", "pictures", "PSNR", "moving PSNR", "still PSNR", "FLIP"),
     "decode": ("scene", "segments", "symbols", "one thread ms", "two threads ms", "slowest segment ms"),
     "scaling": ("by", "amount", "reading s", "training s", "the rest s", "peak MB"),
     "pictures": ("scene", "dataset", "views", "PSNR dB", "moving", "still"),
@@ -386,4 +396,5 @@ TITLES = {
     "scaling": "Encoding by the size of the work",
     "pictures": "Pictures beside truth",
     "quality": "Quality of held-out views, moving and still pixels apart",
+    "ceiling": "Frames trained alone, moving and still pixels of the clip apart",
 }

@@ -1,4 +1,4 @@
-"""The subcommands of kpbench that encode: encode, curve, ablate, step and groups."""
+"""The subcommands of kpbench that encode: encode, curve, ablate, step, groups and ceiling."""
 
 import argparse
 import sys
@@ -67,18 +67,30 @@ def add_parsers(kinds: Any) -> None:
     )
     groups.set_defaults(measure=_groups)
 
-    for parser in (encode, ablate, groups):
+    ceiling = kinds.add_parser(
+        "ceiling",
+        help="frames trained alone, as a measure for what moves",
+        description="Train frames of each dataset alone, as still scenes, and compare them with its held-out views, "
+        "moving and still pixels of the clip apart.",
+    )
+    ceiling.add_argument(
+        "--frames", type=harness.positive, default=3, help="frames, spread over the clip (default: %(default)s)"
+    )
+    ceiling.set_defaults(measure=_ceiling)
+
+    for parser in (encode, ablate, groups, ceiling):
         of = " of the first group" if parser is groups else ""
         parser.add_argument("--steps", type=harness.positive, help=f"optimiser steps{of} instead of the preset's")
-    for parser in (encode, curve, ablate, step, groups):
+    for parser in (encode, curve, ablate, step, groups, ceiling):
         _add_common(parser)
-    for parser in (curve, ablate, step, groups):
+    for parser in (curve, ablate, step, groups, ceiling):
         parser.set_defaults(psnr=None)
-    for parser in (encode, curve, ablate, groups):
+    for parser in (encode, curve, ablate, groups, ceiling):
         parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train")
-        parser.add_argument(
-            "--test-views", type=harness.positive, metavar="N", help="test on at most N held-out pictures, not on all"
-        )
+        if parser is not ceiling:  # which compares with all of its few frames
+            parser.add_argument(
+                "--test-views", type=harness.positive, metavar="N", help="test on at most N held-out pictures, not all"
+            )
         parser.add_argument(
             "--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files, and the .kpck files for `codec`, here"
         )
@@ -226,6 +238,47 @@ def _groups(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
         from kpc.tools.bench import plot  # needs matplotlib
 
         plot.save(plot.per_frame(records), options.out.with_suffix(".svg"))
+
+
+def _ceiling(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
+    """Yield one record per dataset."""
+    harness.encoder()
+    from kpc.tools.bench import ceiling, quality  # need torch
+
+    with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
+        for source in options.datasets:
+            folder = harness.existing_folder(source)
+            settings = {
+                "dataset": folder.resolve().name,
+                "preset": options.preset,
+                "steps": options.steps,
+                "frames": options.frames,
+                "downscale": options.downscale,
+                "space": options.space,
+                "box": options.box,
+            }
+            record = harness.new_record("ceiling", folder, origin, settings)
+            print(f"kpbench: {record['name']}, {options.preset}, {options.frames} frames alone", file=sys.stderr)
+            kept = options.keep_scenes or Path(scratch)
+            kept.mkdir(parents=True, exist_ok=True)
+            job = replace(
+                _job(
+                    options,
+                    folder,
+                    options.seed,
+                    kept / f"{record['name']}-frame.kpc",
+                    Path(scratch) / f"{record['name']}.work",
+                ),
+                steps=options.steps,
+            )
+            found = harness.isolated(ceiling.measure, ceiling.Job(job, options.frames))
+            print(quality.frame_table(found["frames"]), file=sys.stderr)
+            yield record | {
+                "seed": options.seed,
+                "renderer": "cpu",
+                "frames": found["frames"],
+                "repeats": [found["means"]],
+            }
 
 
 def _job(options: argparse.Namespace, source: Path, seed: int, output: Path, work: Path) -> Any:

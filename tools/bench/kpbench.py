@@ -5,6 +5,7 @@
     kpbench ablate default --preset fast --steps 2000 --out docs/bench/ablate.json
     kpbench step room soldier --preset balanced --out docs/bench/step.json
     kpbench groups long_clip --preset fast --group 5s --out docs/bench/groups.json
+    kpbench ceiling room --preset balanced --frames 3 --out docs/bench/ceiling.json
     kpbench player room.kpc liam.kpc --out docs/bench/player.json
     kpbench stream room.kpc liam.kpc --out docs/bench/stream.json
     kpbench window room.kpc liam.kpc --out docs/bench/window.json
@@ -86,8 +87,8 @@ def _parser() -> argparse.ArgumentParser:
     kinds = parser.add_subparsers(
         dest="kind",
         required=True,
-        metavar="encode|curve|ablate|step|groups|player|stream|window|steady|web|codec|entropy|decode|quality|pictures|"
-        "scaling|compare|report|suite",
+        metavar="encode|curve|ablate|step|groups|ceiling|player|stream|window|steady|web|codec|entropy|decode|quality|"
+        "pictures|scaling|compare|report|suite",
     )
     for name, (_, help) in APART.items():
         kinds.add_parser(name, add_help=False, help=help)

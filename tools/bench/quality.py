@@ -101,7 +101,7 @@ def measure(job: Job) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="kpbench-") as work:
         dataset = load_dataset(job.dataset, Path(work), holdout=job.holdout, downscale=job.downscale)
         shown = held_out_frames(groups, dataset, job.most)
-        found = sorted(_frames(shown, dataset), key=lambda frame: (frame.camera, frame.frame))
+        found = sorted(measured_frames(shown, dataset), key=lambda frame: (frame.camera, frame.frame))
     if not found:
         raise DatasetError(f"{job.dataset}: holds out no picture to compare with; give --holdout NAME")
     frames = [asdict(frame) for frame in found]
@@ -117,7 +117,8 @@ def held_out_frames(groups: Groups, dataset: Dataset, most: int | None) -> Itera
     yield from progress(shown_frames(groups, dataset, wanted), "comparing", len(wanted), unit="pictures")
 
 
-def _frames(pictures: Iterable[Shown], dataset: Dataset) -> Iterator[Frame]:
+def measured_frames(pictures: Iterable[Shown], dataset: Dataset) -> Iterator[Frame]:
+    """Measure held-out pictures of a dataset; flicker where a frame follows the one before."""
     moving = MovingPixels(dataset)
     number_of = {int(offset): number for number, offset in enumerate(dataset.pictures.offset)}
     before: dict[int, Shown] = {}
