@@ -5,11 +5,12 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from kpc.tools.bench import web_page
+from kpc.tools.bench import scaling, web_page
 
 REPEATS = "3"  # of whatever is compared by time
 DEFAULT = "default"  # the generated scene
 LONG = "long"  # the generated clip in groups
+BOX = "--box=" + ",".join(map(str, scaling.BOX))
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class Effort:
         steps: optimiser steps of ablations, scaling and groups.
         frames: that the player draws, and that a long playback does.
         views: held-out pictures of ablations.
+        repeats: of whatever is compared by time.
         minutes: factor of the expected ones.
     """
 
@@ -76,6 +78,7 @@ class Effort:
     steps: tuple[int, int, int]
     frames: tuple[int, int]
     views: int
+    repeats: str
     minutes: float
 
 
@@ -84,11 +87,12 @@ HOUR = Effort(
     long=("--frames", "90", "--cameras", "8", "--size", "128x96", "--samples", "1"),
     group="2.5s",
     preset="balanced",
-    curves={"fast": "0.5,1", "balanced": "1,2"},
+    curves={"fast": "0.5,1", "balanced": "0.5,1.5"},
     encode=(),
     steps=(200, 50, 200),
     frames=(40, 1000),
     views=4,
+    repeats=REPEATS,
     minutes=1.0,
 )
 QUICK = Effort(
@@ -101,6 +105,7 @@ QUICK = Effort(
     steps=(5, 5, 20),
     frames=(3, 40),
     views=1,
+    repeats="1",
     minutes=0.1,
 )
 
@@ -120,10 +125,10 @@ def generated(effort: Effort) -> list[Step]:
         (f"{main}.kpc", f"{main}.kpck"),
     )
     # The coder is compared on the draft, since what it searches takes longest.
-    coded = "kept/default-draft-0"
+    coded = "kept/default-draft" + "-0" * (effort.repeats != "1")
     draft = Step(
         "encode-draft",
-        ("encode", DEFAULT, "--preset", "draft", *effort.encode, "--repeats", REPEATS, "--keep-scenes", "kept"),
+        ("encode", DEFAULT, "--preset", "draft", *effort.encode, "--repeats", effort.repeats, "--keep-scenes", "kept"),
         5.5,
         ("scene",),
         (f"{coded}.kpck",),
@@ -132,12 +137,12 @@ def generated(effort: Effort) -> list[Step]:
         Step(
             f"curve-{preset}",
             ("curve", DEFAULT, "--preset", preset, "--minutes", minutes),
-            {"draft": 3, "fast": 4, "balanced": 6}[preset],
+            {"draft": 3, "fast": 4, "balanced": 4.5}[preset],
             ("scene",),
         )
         for preset, minutes in effort.curves.items()
     ]
-    ablate = ("ablate", DEFAULT, "--preset", "draft", "--steps", ablate_steps, "--test-views", str(effort.views))
+    ablate = ("ablate", DEFAULT, "--preset", "draft", "--steps", ablate_steps, "--test-views", str(effort.views), BOX)
     groups = (
         "groups",
         LONG,
@@ -154,13 +159,13 @@ def generated(effort: Effort) -> list[Step]:
         draft,
         *curves,
         Step("ablate", ablate, 5, ("scene",)),
-        Step("scaling", ("scaling", "--steps", scaling_steps, "--repeats", REPEATS), 6.5),
+        Step("scaling", ("scaling", "--steps", scaling_steps, "--repeats", effort.repeats), 6.5),
         long_clip,
         Step("groups", (*groups, "--test-views", "12"), 2.5, ("scene-long",)),
-        Step("step", ("step", DEFAULT, "--preset", effort.preset, "--repeats", REPEATS), 1.5, ("scene",)),
-        *_of_file("", f"{main}.kpc", "encode", effort.frames),
+        Step("step", ("step", DEFAULT, "--preset", effort.preset, "--repeats", effort.repeats), 3, ("scene",)),
+        *_of_file("", f"{main}.kpc", "encode", effort.frames, effort.repeats),
         Step("codec", ("codec", f"{coded}.kpck", "--dataset", DEFAULT), 4, ("scene", "encode-draft")),
-        *_of_truth("", DEFAULT, f"{main}.kpc", ("scene", "encode")),
+        *_of_truth("", DEFAULT, f"{main}.kpc", ("scene", "encode"), effort.repeats),
     ]
     return [replace(step, minutes=round(step.minutes * effort.minutes, 2)) for step in steps]
 
@@ -191,9 +196,9 @@ def of_scene(name: str) -> list[Step]:
     ]
 
 
-def _of_file(end: str, file: str, encode: str, frames: tuple[int, int]) -> list[Step]:
+def _of_file(end: str, file: str, encode: str, frames: tuple[int, int], repeats: str = REPEATS) -> list[Step]:
     """Return the steps that play a file; their names have an `end`."""
-    timed = ("--repeats", REPEATS)
+    timed = ("--repeats", repeats)
     player = [
         Step(
             f"player{end}-{size}",
@@ -214,11 +219,11 @@ def _of_file(end: str, file: str, encode: str, frames: tuple[int, int]) -> list[
     ]
 
 
-def _of_truth(end: str, dataset: str, file: str, needs: tuple[str, ...]) -> list[Step]:
+def _of_truth(end: str, dataset: str, file: str, needs: tuple[str, ...], repeats: str = REPEATS) -> list[Step]:
     """Return the steps that decode a file and compare it with the truth; their names have an `end`."""
     return [
         Step(f"entropy{end}", ("entropy", file), 0.3, needs),
-        Step(f"decode{end}", ("decode", file, "--repeats", REPEATS), 0.3, needs),
+        Step(f"decode{end}", ("decode", file, "--repeats", repeats), 0.3, needs),
         Step(f"quality{end}", ("quality", file, dataset), 0.5, needs),
         Step(f"pictures{end}", ("pictures", file, dataset), 0.3, needs),
     ]
