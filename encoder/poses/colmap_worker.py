@@ -39,6 +39,8 @@ LEAST_VIEWS = 3
 # Matches agree with a geometry to within this share of the larger side of pictures, or a pixel. COLMAP's own 4 pixels
 # are so much for large pictures; in small ones, all that a plane shows agrees with wrong geometries, too.
 VERIFIED = 0.0025
+# Matches confirm a model if they agree with it to within so many times that.
+CONFIRMED = 2.0
 # Mean distance in pixels between points and where they were found, below which a model of all views is believed.
 GOOD_ERROR = 1.0
 
@@ -59,12 +61,13 @@ def main(folder: Path) -> None:
     database = folder / "views.db"
     _write_views(database, job, [keypoints for keypoints, _ in pictures], matches)
     _verify(database, job)
-    model = _reconstruct(folder, database, job)
-    found: dict[str, Any] = {"pairs": _pairs(database), "views": {}}
+    model, apart = _reconstruct(folder, database, job)
+    found: dict[str, Any] = {"views": {}, "apart": apart}
     arrays: dict[str, Any] = {}
     if model is not None:
         model = _with_best_cameras(model, job["is_rig"])
         found["views"], arrays = _views(model), _points(model)
+    found["pairs"] = _pairs(database, model)
     np.savez(folder / "result.npz", **arrays)
     (folder / "result.json").write_text(json.dumps(found))
 
@@ -178,29 +181,72 @@ def _verify(database: Path, job: dict[str, Any]) -> None:
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job["seed"]
     largest = max(max(camera["size"]) for camera in job["cameras"])
-    options.ransac.max_error = max(VERIFIED * largest, 1.0)
+    options.ransac.max_error = _tolerance(largest)
     pycolmap.geometric_verification(
         database, pycolmap.GeometricVerifierOptions(num_threads=job["threads"]), two_view_geometry_options=options
     )
 
 
-def _pairs(file: Path) -> list[tuple[int, int, int, int]]:
-    """Return for each two views that matched: their numbers, the matches, and those that agree with one geometry."""
+def _pairs(file: Path, model: pycolmap.Reconstruction | None) -> list[tuple[int, int, int, int, float | None]]:
+    """Describe the matches of each two views.
+
+    Returns:
+        Numbers of the views, the matches, those that agree with one geometry, and the share of these that agree with
+        where the model has the views; None if it lacks one of them, or nothing agrees.
+    """
     database = pycolmap.Database.open(file)
     agreeing = dict(zip(*database.read_two_view_geometry_num_inliers(), strict=True))
+    placed = set() if model is None else set(model.reg_image_ids())
     found = []
     for pair, count in zip(*database.read_num_matches(), strict=True):
         one, two = pycolmap.pair_id_to_image_pair(pair)
-        found.append((one - 1, two - 1, count, agreeing.get(pair, 0)))
+        share = None
+        if model is not None and agreeing.get(pair) and placed.issuperset((one, two)):
+            matches = database.read_two_view_geometry(one, two).inlier_matches
+            share = _confirmed(
+                model, one, two, *(_places(database, n, matches[:, k]) for k, n in enumerate((one, two)))
+            )
+        found.append((one - 1, two - 1, count, agreeing.get(pair, 0), share))
     database.close()
     return found
 
 
-def _reconstruct(folder: Path, database: Path, job: dict[str, Any]) -> pycolmap.Reconstruction | None:
-    """Place the views all at once, and one after another where that leaves some out; return the better model.
+def _places(database: pycolmap.Database, number: int, features: np.ndarray) -> np.ndarray:
+    """Return where numbered features of a view lie, (M, 2) float64 pixels."""
+    return np.asarray(database.read_keypoints(number), np.float64)[features, :2]
+
+
+def _confirmed(model: pycolmap.Reconstruction, one: int, two: int, in_one: np.ndarray, in_two: np.ndarray) -> float:
+    """Return the share of matches that lie on each other's epipolar lines, by Sampson's distance, (M, 2) pixels."""
+    images = [model.images[number] for number in (one, two)]
+    cameras = [model.cameras[image.camera_id] for image in images]
+    a, b = (
+        np.pad(camera.cam_from_img(at), ((0, 0), (0, 1)), constant_values=1.0)
+        for camera, at in zip(cameras, (in_one, in_two), strict=True)
+    )
+    relative = (images[1].cam_from_world() * images[0].cam_from_world().inverse()).matrix()
+    x, y, z = relative[:, 3]
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:, :3]
+    lines_two, lines_one = a @ essential.T, b @ essential
+    slopes = np.square(lines_one[:, :2]).sum(1) + np.square(lines_two[:, :2]).sum(1)
+    distance = np.abs((b * lines_two).sum(1)) / np.sqrt(np.maximum(slopes, 1e-24))
+    focal = min(camera.mean_focal_length() for camera in cameras)
+    return float((distance * focal <= CONFIRMED * _tolerance(max(max(c.width, c.height) for c in cameras))).mean())
+
+
+def _tolerance(largest: int) -> float:
+    """Return how far matches may be from a geometry, in pixels, in pictures of such a larger side."""
+    return max(VERIFIED * largest, 1.0)
+
+
+def _reconstruct(folder: Path, database: Path, job: dict[str, Any]) -> tuple[pycolmap.Reconstruction | None, list[int]]:
+    """Place the views all at once, and one after another where that leaves some out.
 
     Focal lengths are estimated from pairs of views first: with COLMAP's assumption alone, rigs of few views end in a
     wrong one.
+
+    Returns:
+        The better model, and the views that another one has and it has not, by their numbers.
     """
     output = folder / "models"
     output.mkdir(exist_ok=True)
@@ -212,7 +258,10 @@ def _reconstruct(folder: Path, database: Path, job: dict[str, Any]) -> pycolmap.
         best = max(models, key=lambda model: (model.num_reg_images(), -_mean_error(model)), default=None)
         if best is not None and best.num_reg_images() == total and _mean_error(best) < GOOD_ERROR:
             break
-    return best
+    placed = set() if best is None else set(best.reg_image_ids())
+    others = [set(model.reg_image_ids()) - placed for model in models]
+    apart = max((other for other in others if len(other) >= LEAST_VIEWS), key=len, default=set[int]())
+    return best, sorted(number - 1 for number in apart)
 
 
 def _map_globally(folder: Path, database: Path, output: Path, job: dict[str, Any]) -> list[pycolmap.Reconstruction]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.poses.clocks import UNKNOWN, Clock
+from kpc.encoder.poses.doubts import MATCHED, doubts
 from kpc.encoder.poses.footage import Footage, find_footage
 from kpc.encoder.poses.given_clocks import read_clocks
 from kpc.encoder.poses.instants import Picture, grey_of, moving_pictures, still_pictures
@@ -32,8 +33,6 @@ FRAMES = Pairing((1, 2, 4, 8, 16, 32), alike=5, every=3)
 PHOTOGRAPHS = Pairing((1, 2), alike=20)
 # A scene cannot be made from fewer cameras.
 LEAST_CAMERAS = 3
-# Pairs of cameras are named as matching if so many features agree.
-MATCHED = 15
 
 
 @dataclass(frozen=True)
@@ -92,6 +91,8 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
                 "--rig still if they do not move"
             )
     _check(root, found, wishes.require_all)
+    for doubt in doubts(found.kind, found.view_names, found.structure):
+        print(f"{root}: warning: {doubt}", file=sys.stderr)
     return _scaled(root, found, wishes)
 
 
@@ -215,9 +216,9 @@ def _check(root: Path, found: Found, require_all: bool) -> None:
 
 def _neighbours(structure: Structure, number: int) -> list[int]:
     agreeing = {
-        (two if one == number else one): count
-        for (one, two), (_, count) in structure.pairs.items()
-        if number in (one, two) and count >= MATCHED
+        (two if one == number else one): pair.agreeing
+        for (one, two), pair in structure.pairs.items()
+        if number in (one, two) and pair.agreeing >= MATCHED
     }
     return sorted(agreeing, key=lambda other: -agreeing[other])
 

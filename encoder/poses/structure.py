@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,6 +63,20 @@ class PlacedView:
     error: float
 
 
+class Pair(NamedTuple):
+    """How the features of two views match.
+
+    Attributes:
+        matches: how many do.
+        agreeing: how many of these agree with one geometry.
+        confirmed: share of those that agree with where the views were placed; None if one was not, or none agrees.
+    """
+
+    matches: int
+    agreeing: int
+    confirmed: float | None
+
+
 @dataclass(frozen=True)
 class Structure:
     """What structure from motion found.
@@ -70,13 +85,15 @@ class Structure:
         views: those that were placed, by number.
         points: (N, 3) float64.
         observations: (M, 4) float64: number of the point, of the view, x and y in its picture.
-        pairs: for each two views that match, how many features match and how many of these agree with one geometry.
+        pairs: how the features of each two views match.
+        apart: views that were not placed with these, but with each other.
     """
 
     views: dict[int, PlacedView]
     points: np.ndarray
     observations: np.ndarray
-    pairs: dict[tuple[int, int], tuple[int, int]]
+    pairs: dict[tuple[int, int], Pair]
+    apart: tuple[int, ...] = ()
 
     @property
     def error(self) -> float:
@@ -227,7 +244,8 @@ def _read(folder: Path) -> Structure:
         views,
         arrays["points"] if "points" in arrays else empty,
         arrays["observations"] if "observations" in arrays else np.zeros((0, 4)),
-        {(one, two): (matches, agreeing) for one, two, matches, agreeing in found["pairs"]},
+        {(one, two): Pair(*facts) for one, two, *facts in found["pairs"]},
+        tuple(found["apart"]),
     )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import textured_room
 from kpc.encoder.datasets import load_dataset
 from kpc.encoder.poses.footage import find_footage
 from kpc.format.common.errors import DatasetError
@@ -127,6 +128,7 @@ def test_a_carried_camera_is_placed(walk, kind, tmp_path, capsys):
     options = ["--rig", "moving"] if kind == "moving camera" else []
     assert kpposes.main([str(folder), "-o", str(file), *options]) == 0
     said, document = capsys.readouterr().err, json.loads(file.read_text())
+    assert "warning" not in said
     assert document["kind"] == kind
     assert ("--rig moving for the frames of a clip" in said) == (kind == "photographs")
     frames = document["frames"]
@@ -136,6 +138,14 @@ def test_a_carried_camera_is_placed(walk, kind, tmp_path, capsys):
     assert all(("far" in frame) == (kind == "moving camera") for frame in frames)
     times = [frame.get("time") for frame in frames]
     assert times == (pytest.approx(np.linspace(0, 1, 5)) if kind == "moving camera" else [None] * 5)
+
+
+def test_patterns_that_repeat_themselves_are_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(textured_room, "PERIOD", 200)
+    monkeypatch.setattr(textured_room, "_texture", textured_room._texture.__wrapped__)
+    write_pictures(tmp_path / "pictures", rig(8)[2:])
+    assert kpposes.main([str(tmp_path / "pictures")]) == 0
+    assert "contradict where these were placed: patterns that repeat themselves" in capsys.readouterr().err
 
 
 def test_two_cameras_are_too_few(tmp_path, capsys):

@@ -1,0 +1,85 @@
+"""Reasons to doubt a model in spite of small errors: patterns that repeat themselves, and places that cannot be."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kpc.encoder.datasets.capture import first_names
+from kpc.encoder.poses.orientation import extent
+from kpc.encoder.poses.structure import Structure
+
+# Views are compared by the features that agree with one geometry of two, if so many do.
+MATCHED = 15
+# A view is doubtful if less than this share of these agrees with where it was placed. Right ones have 0.74 or more
+# (liam, whose walls repeat themselves in places; 0.98 in room and the default scene), wrong ones 0.1 to 0.6.
+CONFIRMED = 0.65
+# Cameras of a rig are at one place if they are nearer than this share of its extent.
+ONE_PLACE = 0.005
+# A moving camera jumps if it moves so many times as far as is usual around that frame, and by this share of its path's
+# extent; so many frames before and after are looked at.
+JUMP, JUMP_EXTENT, AROUND = 12.0, 0.03, 15
+
+
+def doubts(kind: str, names: Sequence[str], structure: Structure) -> list[str]:
+    """Return what speaks against a model, in one clause each.
+
+    Args:
+        kind: what the footage was taken for, as in `find.Found`.
+        names: of the views.
+        structure: the model.
+    """
+    found = []
+    shares = confirmed_shares(structure)
+    doubtful = [f"{names[view]} ({share:.0%})" for view, share in shares.items() if share < CONFIRMED]
+    if doubtful:
+        found.append(
+            f"matches of {first_names(doubtful)} contradict where these were placed: patterns that repeat themselves, "
+            "such as tiles or windows, may have been mistaken for each other; film with something unlike beside them"
+        )
+    if structure.apart:
+        found.append(
+            f"{first_names([names[view] for view in structure.apart])} fit each other but not the rest; film what "
+            "connects them"
+        )
+    if kind == "still rig":
+        found += [f"{names[one]} and {names[two]} were placed at one point" for one, two in _at_one_place(structure)]
+    if kind == "moving camera":
+        jumps = [f"{names[one]} and {names[two]}" for one, two in _jumps(structure)]
+        if jumps:
+            found.append(
+                f"the path jumps between {first_names(jumps)}: the clip is cut there, or its frames were placed wrongly"
+            )
+    return found
+
+
+def confirmed_shares(structure: Structure) -> dict[int, float]:
+    """Return by view the share of its verified matches with other placed views that agrees with the model."""
+    counts: dict[int, list[float]] = {}
+    for views, pair in structure.pairs.items():
+        if pair.confirmed is not None and pair.agreeing >= MATCHED:
+            for view in views:
+                total = counts.setdefault(view, [0.0, 0.0])
+                total[0] += pair.agreeing * pair.confirmed
+                total[1] += pair.agreeing
+    return {view: agreeing / total for view, (agreeing, total) in sorted(counts.items())}
+
+
+def _at_one_place(structure: Structure) -> list[tuple[int, int]]:
+    numbers = sorted(structure.views)
+    poses = np.stack([structure.views[number].camera_to_world for number in numbers])
+    centres, least = poses[:, :3, 3], ONE_PLACE * extent(poses)
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    return [(numbers[i], numbers[j]) for i, j in np.argwhere(np.triu(apart < least, 1)).tolist()]
+
+
+def _jumps(structure: Structure) -> list[tuple[int, int]]:
+    """Return frames between which the camera moves much further than around them."""
+    numbers = np.array(sorted(structure.views))
+    poses = np.stack([structure.views[int(number)].camera_to_world for number in numbers])
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / np.diff(numbers)
+    found = []
+    for k in np.flatnonzero(steps > JUMP_EXTENT * extent(poses)).tolist():
+        around = np.delete(steps[max(k - AROUND, 0) : k + AROUND + 1], min(k, AROUND))
+        if len(around) >= 4 and steps[k] > JUMP * float(np.median(around)):
+            found.append((int(numbers[k]), int(numbers[k + 1])))
+    return found

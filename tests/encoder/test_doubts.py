@@ -1,0 +1,66 @@
+"""What speaks against a model of cameras."""
+
+import numpy as np
+
+from kpc.encoder.poses.doubts import confirmed_shares, doubts
+from kpc.encoder.poses.structure import Pair, PlacedView, Structure
+
+NAMES = [f"cam{number:02d}" for number in range(30)]
+
+
+def structure(centres: np.ndarray, pairs: dict[tuple[int, int], Pair] | None = None, apart=()) -> Structure:
+    """Return a model of views at some places, (N, 3)."""
+    views = {}
+    for number, centre in enumerate(centres):
+        pose = np.eye(4)
+        pose[:3, 3] = centre
+        views[number] = PlacedView(pose, (100.0, 100.0, 50.0, 50.0), (0.0,) * 4, 100, 0.2)
+    return Structure(views, np.zeros((0, 3)), np.zeros((0, 4)), pairs or {}, apart)
+
+
+def line(count: int) -> np.ndarray:
+    return np.stack([np.arange(count) ** 1.1, np.zeros(count), np.zeros(count)], axis=1)
+
+
+def test_nothing_speaks_against_a_good_model():
+    pairs = {
+        (0, 1): Pair(120, 100, 0.98),
+        (1, 2): Pair(90, 80, 0.9),
+        (0, 2): Pair(20, 6, 0.0),
+        (0, 4): Pair(9, 0, None),
+    }
+    for kind in ("still rig", "moving camera", "photographs"):
+        assert doubts(kind, NAMES, structure(line(12), pairs)) == []
+
+
+def test_matches_that_contradict_the_model_are_named():
+    pairs = {
+        (0, 1): Pair(120, 100, 1.0),
+        (1, 2): Pair(90, 50, 0.3),
+        (0, 2): Pair(40, 20, 0.1),
+        (0, 3): Pair(30, 30, None),
+    }
+    model = structure(line(4), pairs)
+    assert confirmed_shares(model) == {0: 102 / 120, 1: 115 / 150, 2: 17 / 70}
+    (said,) = doubts("still rig", NAMES, model)
+    assert said.startswith("matches of cam02 (24%) contradict where these were placed")
+
+
+def test_views_that_only_fit_each_other_are_named():
+    (said,) = doubts("photographs", NAMES, structure(line(4), apart=(7, 8, 9)))
+    assert said.startswith("cam07, cam08, cam09 fit each other but not the rest")
+
+
+def test_cameras_at_one_point_are_named_in_a_rig_only():
+    centres = line(5)
+    centres[3] = centres[1] + 1e-4
+    assert doubts("still rig", NAMES, structure(centres)) == ["cam01 and cam03 were placed at one point"]
+    assert doubts("photographs", NAMES, structure(centres)) == []
+
+
+def test_a_jump_of_a_moving_camera_is_named():
+    centres = line(24)
+    centres[10:] += [0, 40, 0]
+    (said,) = doubts("moving camera", NAMES, structure(centres))
+    assert said.startswith("the path jumps between cam09 and cam10:")
+    assert doubts("photographs", NAMES, structure(centres)) == []
