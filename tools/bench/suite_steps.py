@@ -87,10 +87,10 @@ HOUR = Effort(
     long=("--frames", "90", "--cameras", "8", "--size", "128x96", "--samples", "1"),
     group="2.5s",
     preset="balanced",
-    curves={"fast": "0.5,1", "balanced": "0.5,1.5"},
+    curves={"fast": "0.5,1", "balanced": "1.5"},
     encode=(),
     steps=(200, 50, 200),
-    frames=(40, 1000),
+    frames=(20, 1000),
     views=4,
     repeats=REPEATS,
     minutes=1.0,
@@ -137,7 +137,7 @@ def generated(effort: Effort) -> list[Step]:
         Step(
             f"curve-{preset}",
             ("curve", DEFAULT, "--preset", preset, "--minutes", minutes),
-            {"draft": 3, "fast": 4, "balanced": 4.5}[preset],
+            {"draft": 3, "fast": 4, "balanced": 3}[preset],
             ("scene",),
         )
         for preset, minutes in effort.curves.items()
@@ -203,10 +203,10 @@ def _of_file(end: str, file: str, encode: str, frames: tuple[int, int], repeats:
         Step(
             f"player{end}-{size}",
             ("player", file, "--size", size, "--frames", str(frames[0]), *timed),
-            2.5,
+            minutes,
             (encode,),
         )
-        for size in ("320x240", "640x480")
+        for size, minutes in (("320x240", 2), ("640x480", 4.5))
     ]
     steady = ("steady", file, "--frames", str(frames[1]))
     return [
