@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from kpc.encoder.datasets import Dataset
+from kpc.encoder.field.adam import Adam
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import march_scene
 from kpc.encoder.field.render import Rays, shade
@@ -119,7 +120,7 @@ def fit_code(scene: Scene, field: Field, rays: Rays, targets: Tensor) -> np.ndar
         _, weighed = march_scene(field, rays, scene)
         kept = weighed.weights > FIT_MIN_WEIGHT
         weighed = replace(weighed, **{name: getattr(weighed, name)[kept] for name in ("ray", "latent", "weights")})
-    optimiser = torch.optim.Adam([code], lr=FIT_RATE)
+    optimiser = Adam([{"params": [code], "lr": FIT_RATE}])
     for _ in range(FIT_STEPS):
         optimiser.zero_grad()
         (shade(field, rays, weighed, code) - targets).square().mean().backward()

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from kpc.encoder.field import kernels
+from kpc.encoder.field.adam import Adam
 from kpc.encoder.field.config import TrainConfig, Variation
 from kpc.encoder.field.field import Field
 from kpc.format.scene.scene import SPACE_PLANES
@@ -73,7 +74,9 @@ def total(weighted: dict[str, torch.Tensor]) -> torch.Tensor:
     return torch.stack(list(weighted.values())).sum()
 
 
-def decoder_optimiser(field: Field, config: TrainConfig, others: Sequence[torch.nn.Parameter] = ()) -> torch.optim.Adam:
+def decoder_optimiser(
+    field: Field, config: TrainConfig, others: Sequence[torch.nn.Parameter] = ()
+) -> Adam | torch.optim.Adam:
     """Return Adam for all parameters but the planes, and for `others` at the decoder's learning rate."""
     decoder = [*field.decoder_parameters(config.view_dependent), *others]
     motion = [] if field.motion is None else [([field.motion], config.motion_learning_rate)]
@@ -81,18 +84,15 @@ def decoder_optimiser(field: Field, config: TrainConfig, others: Sequence[torch.
     return make_adam([(decoder, config.decoder_learning_rate), *motion, *codes])
 
 
-def make_adam(groups: list[tuple[list[torch.nn.Parameter], float]]) -> torch.optim.Adam:
+def make_adam(groups: list[tuple[list[torch.nn.Parameter], float]]) -> Adam | torch.optim.Adam:
     """Return Adam for groups of parameters, each with its peak learning rate."""
-    on_gpu = groups[0][0][0].is_cuda
-    return torch.optim.Adam(
-        [{"params": parameters, "peak": peak, "lr": peak} for parameters, peak in groups],
-        betas=(BETA1, BETA2),
-        eps=EPSILON,
-        fused=on_gpu,
-    )
+    described = [{"params": parameters, "peak": peak, "lr": peak} for parameters, peak in groups]
+    if groups[0][0][0].is_cuda:
+        return torch.optim.Adam(described, betas=(BETA1, BETA2), eps=EPSILON, fused=True)
+    return Adam(described, betas=(BETA1, BETA2), eps=EPSILON)
 
 
-def set_rate(optimiser: torch.optim.Adam, rate: float) -> None:
+def set_rate(optimiser: Adam | torch.optim.Adam, rate: float) -> None:
     """Set the learning rates to a share of their peaks."""
     for group in optimiser.param_groups:
         group["lr"] = group["peak"] * rate

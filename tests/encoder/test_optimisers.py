@@ -1,17 +1,47 @@
 """Feature masks, and the steps of both optimisers, which agree."""
 
+import copy
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from kpc.encoder.datasets import Dataset
+from kpc.encoder.field.adam import Adam
 from kpc.encoder.training.optimisers import feature_mask
 from kpc.format.scene.space import Contraction
 from training_runs import CONFIG, torch_twin, trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_adam_is_pytorchs_to_the_bit() -> None:
+    """A parameter without a gradient waits, and each goes on from the state of the other."""
+    start, generator = [torch.randn(50, 3), torch.randn(7), torch.randn(2, 2)], torch.Generator().manual_seed(0)
+
+    def made(kind: type) -> tuple[list[torch.nn.Parameter], Any]:
+        parameters = [torch.nn.Parameter(values.clone()) for values in start]
+        groups = [{"params": parameters[:2], "lr": 0.1}, {"params": parameters[2:], "lr": 0.01}]
+        return parameters, kind(groups, betas=(0.9, 0.99), eps=1e-15)
+
+    (ours, one), (theirs, other) = made(Adam), made(torch.optim.Adam)
+    for number in range(6):
+        for optimiser in (one, other):
+            optimiser.zero_grad()
+            optimiser.param_groups[0]["lr"] = 0.1 / (1 + number)
+        for mine, yours in list(zip(ours, theirs, strict=True))[number % 2 :]:
+            mine.grad = torch.randn(mine.shape, generator=generator)
+            yours.grad = mine.grad.clone()
+        one.step()
+        other.step()
+        assert all(torch.equal(mine, yours) for mine, yours in zip(ours, theirs, strict=True))
+        if number == 3:
+            a, b = copy.deepcopy(one.state_dict()), copy.deepcopy(other.state_dict())
+            one.load_state_dict(b)
+            other.load_state_dict(a)
+    assert not torch.equal(ours[0], start[0])
 
 
 def test_scale_dropout_drops_finer_scales(moving: Dataset) -> None:
