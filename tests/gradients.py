@@ -1,4 +1,4 @@
-"""Gradients of the fused kernels and of the float64 reference, for the tests that compare them."""
+"""Scenes, rays and functions for the tests of gradients (`kpc.tools.bench.stability.gradients`)."""
 
 from dataclasses import replace
 
@@ -6,9 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kpc.encoder.field import fused, kernels
 from kpc.encoder.field.field import Field
-from kpc.encoder.field.render import Rays, render_reference
+from kpc.encoder.field.render import Rays
 from kpc.encoder.field.sampling import WeightedRowSum, bilinear_corners
 from kpc.format.scene.scene import Scene
 from scenes import tiny_scene, with_contraction, with_motion
@@ -45,75 +44,6 @@ def random_rays(scene: Scene, count: int, seed: int = 0) -> Rays:
     directions = np.concatenate([directions[chosen], np.eye(3)])
     arrays = (origins, directions, rng.random(count), rng.random(count), rng.random((count, 3)))
     return Rays.from_arrays(*arrays)
-
-
-# Weight of the distortion loss in these tests, large enough to matter beside the colour loss.
-DISTORTION = 0.3
-
-
-def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int = 2) -> dict[str, np.ndarray]:
-    """Return the gradients of the fused kernels, summed over workers, with the errors and sample counts of rays."""
-    field = Field.from_scene(scene)
-    layout, n = field.layout, len(targets)
-    grad = np.zeros((workers, layout.size), np.float32)
-    grad_density = np.zeros((workers, layout.features + 1), np.float32)
-    basis = field.basis(rays.directions).detach().numpy()
-    grad_basis = np.zeros((n, 3, layout.features), np.float32)
-    planes = fused.planes_of(field)
-    grad_motion = np.zeros((workers, *planes.motion.shape), np.float32)
-    grad_rays = np.zeros((n, kernels.RAY_GRADIENTS), np.float32)
-    peaks = np.zeros((workers, *scene.occupancy.shape[1:]), np.float32)
-    errors, counts = kernels.backpropagate(
-        planes,
-        field.density.detach().numpy(),
-        fused.volume_of(scene.aabb, scene.occupancy, scene.step, scene.mapping),
-        fused.ray_batch(rays),
-        basis,
-        targets.numpy(),
-        np.float32(DISTORTION),
-        kernels.Gradients(grad, grad_density, grad_basis, grad_motion, scene.motion is not None, grad_rays, True),
-        peaks,
-        fused.max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
-    )
-    return {
-        "theta": grad.sum(0),
-        "density": grad_density.sum(0),
-        "basis": grad_basis,
-        "motion": grad_motion.sum(0),
-        "rays": grad_rays,
-        "errors": errors,
-        "counts": counts,
-        "peaks": peaks.max(0),
-    }
-
-
-def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict[str, np.ndarray]:
-    """Return the same gradients by autograd through `render_reference`, in float64."""
-    field = Field.from_scene(scene).double()
-    rays = rays.map(lambda values: values.double().requires_grad_())
-    basis = field.basis(rays.directions).detach().requires_grad_()
-    # The kernels give the gradient of the basis, the field goes without one.
-    field.ray_terms = lambda directions, codes: basis  # type: ignore[method-assign]
-    field.colours = lambda latent, terms, ray: torch.sigmoid(torch.einsum("nf,ncf->nc", latent, terms[ray]))  # type: ignore[method-assign]
-    aabb, occupancy = torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy)
-    rgb, distortion, weights, cells = render_reference(field, rays, aabb, occupancy, scene.step, mapping=scene.mapping)
-    rgb.retain_grad()
-    squared = (rgb - targets.double()).square()
-    (squared.mean() + DISTORTION * distortion).backward()
-    peaks = torch.zeros(scene.occupancy.shape[1:], dtype=torch.float64)
-    peaks.index_put_(tuple(cells.T), torch.zeros(len(cells), dtype=torch.float64))
-    for cell, weight in zip(cells.tolist(), weights.tolist(), strict=True):
-        peaks[tuple(cell)] = max(float(peaks[tuple(cell)]), weight)
-    return {
-        "theta": field.theta.grad.numpy(),
-        "density": field.density.grad.numpy(),
-        "basis": basis.grad.numpy(),
-        "rays": torch.cat([rays.origins.grad, rays.directions.grad, rays.times.grad[:, None], rgb.grad], 1).numpy(),
-        "motion": None if field.motion is None else field.motion.grad.numpy(),
-        "errors": squared.sum(1).detach().numpy(),
-        "samples": len(weights),
-        "peaks": peaks.numpy(),
-    }
 
 
 class FieldFunction(torch.nn.Module):

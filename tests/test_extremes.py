@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import datasets as make
-from gradients import backpropagate, random_rays, reference_gradients, translucent_scene
+from gradients import random_rays, translucent_scene
 from kpc.encoder.cli.encode_scene import to_scene
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate
@@ -28,6 +28,7 @@ from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import write_image
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION, Scene
+from kpc.tools.bench.stability.gradients import backpropagate, reference_gradients
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = TrainConfig(

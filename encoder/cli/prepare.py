@@ -34,7 +34,7 @@ from kpc.format.common.progress import Progress
 from kpc.format.container import scene_layout
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.sound import Sound
-from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
+from kpc.format.scene.space import FARTHEST_BOX, Contraction, DeviceCoordinates, SpaceMapping, edges_away
 
 
 @dataclass(frozen=True)
@@ -197,6 +197,11 @@ def _check_space(dataset: Dataset, options: Options, aabb: np.ndarray, mapping: 
     ):
         raise DatasetError(
             f"{options.source}: a box from {aabb[0].tolist()} to {aabb[1].tolist()} is too large or too thin; {another}"
+        )
+    if not isinstance(mapping, DeviceCoordinates) and (away := edges_away(aabb, np.zeros(3))) > FARTHEST_BOX:
+        raise DatasetError(
+            f"{options.source}: the box lies {away:,.0f} times its longest edge away from the origin, where numbers "
+            f"are too coarse (at most {FARTHEST_BOX:,.0f}); subtract one position from all cameras, and from --box"
         )
     samples_per_unit = options.config(dataset).samples_across / (aabb[1] - aabb[0]).max()
     if isinstance(mapping, Contraction) and mapping.uniform_distance * samples_per_unit > scene_layout.SAMPLE_LIMIT:

@@ -63,7 +63,7 @@ class WeightedRowSum(torch.autograd.Function):
         sums = nn.functional.embedding_bag(
             corners.view(-1, K), table, per_sample_weights=weights.view(-1, K), mode="sum"
         )
-        return sums.view(*corners.shape[:-1], -1).unbind()
+        return sums.view(*corners.shape[:-1], table.shape[1]).unbind()
 
     @staticmethod
     def backward(ctx, *g):  # type: ignore[no-untyped-def]

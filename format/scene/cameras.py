@@ -63,20 +63,20 @@ class Camera:
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fl_x * sx, self.fl_y * sy, self.cx * sx, self.cy * sy, self.camera_to_world)
 
-    def rays(self) -> tuple[np.ndarray, np.ndarray]:
+    def rays(self, dtype: type[np.floating] = np.float32) -> tuple[np.ndarray, np.ndarray]:
         """Return the rays through all pixel centres, row by row.
 
             d = normalise(R [(i + 0.5 - cx) / fl_x, -(j + 0.5 - cy) / fl_y, -1])
 
         Returns:
-            Origins and unit directions in the world, both (height * width, 3) float32.
+            Origins and unit directions in the world, both (height * width, 3) of `dtype`.
         """
         i, j = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         local = np.stack([(i - self.cx) / self.fl_x, -(j - self.cy) / self.fl_y, -np.ones_like(i)], axis=-1)
         directions = local.reshape(-1, 3) @ self.camera_to_world[:3, :3].T
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         origins = np.broadcast_to(self.camera_to_world[:3, 3], directions.shape)
-        return np.ascontiguousarray(origins, np.float32), directions.astype(np.float32)
+        return np.ascontiguousarray(origins, dtype), directions.astype(dtype)
 
 
 def has_unit_axes(pose: np.ndarray) -> bool:

@@ -19,6 +19,10 @@ MIN_FORWARD = 1e-4
 # The smallest disparity of a sample, relative to that at the start of its ray: samples farther off count as this far.
 MIN_DISPARITY = 1e-6
 
+# How far, in longest edges of the box, its middle may be from the origin, and a camera from its middle, so that float32
+# numbers tell points of the box apart; a few times farther, pictures are off by an 8-bit level (docs/benchmarks.md).
+FARTHEST_BOX, FARTHEST_CAMERA = 1e4, 4e3
+
 
 @dataclass(frozen=True)
 class Contraction:
@@ -153,6 +157,12 @@ class DeviceRays:
         """
         share = np.minimum(s / self.s_infinity[rays, None], s.dtype.type(1 - MIN_DISPARITY))
         return self.t_start[rays, None] + self.t_scale[rays, None] * (share / (1 - share))
+
+
+def edges_away(aabb: np.ndarray, point: np.ndarray) -> float:
+    """Return the distance of a point (3,) from the middle of a box (2, 3), in longest edges of the box."""
+    low, high = aabb.astype(np.float64)
+    return float(np.linalg.norm((low + high) / 2 - point) / (high - low).max())
 
 
 SpaceMapping = Contraction | DeviceCoordinates

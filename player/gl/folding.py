@@ -7,23 +7,42 @@ upsampled along the row first.
 """
 
 import moderngl
+import numpy as np
 
-from kpc.player.atlas import Layout
+from kpc.format.scene.scene import SPACE_PLANES, Scene
+from kpc.player.atlas import FOLDING_AXIS, Layout
 from kpc.player.gl.programs import Programs, draw, set_uniforms
 from kpc.player.gl.targets import allocation
 from kpc.player.gl.textures import PLANES_UNIT, ROWS_UNIT, SceneTextures, plane_texture, texture_bytes
 
 # Texels of a folded plane to one of the scene's, along the folded row.
 UPSAMPLING = 2
-# The largest float16. Folded planes are float16: cards look it up at more than twice the rate of float32, and room is
-# 74 dB and soldier 80 dB from their pictures in float32.
+# The largest float16. Folded planes are float16 where it holds them: cards look it up at more than twice the rate of
+# float32, and room is 74 dB and soldier 80 dB from their pictures in float32.
 LARGEST_HALF = 65504.0
+# The largest number of a channel of a plane from which on float16 holds it to 8 bits and more.
+LEAST_HALF = 2.0**-16
+LARGEST_SINGLE = float(np.finfo(np.float32).max)
 
 
 def folded_layout(textures: SceneTextures) -> Layout:
     """Return the layout of folded planes: upsampled, unless that is more than the card takes."""
     finer = Layout.of(textures.scene, UPSAMPLING)
     return finer if max(finer.size) <= textures.ctx.info["GL_MAX_TEXTURE_SIZE"] else textures.layout
+
+
+def folded_dtype(scene: Scene) -> str:
+    """Return "f2", the type of folded planes, or "f4" where a product may be too large or a channel too small for it.
+
+    Numbers on a plane's way to 0 are small, but where a channel is small everywhere its weights are large.
+    """
+    for scale in scene.scales:
+        for name in SPACE_PLANES:
+            row = np.abs(scale[f"{FOLDING_AXIS[name]}t"]).max(axis=(0, 1))
+            product = np.abs(scale[name]).max(axis=(0, 1)) * np.maximum(row, 1)
+            if product.max() > LARGEST_HALF or (product[product > 0] < LEAST_HALF).any():
+                return "f4"
+    return "f2"
 
 
 class FoldedPlanes:
@@ -41,11 +60,11 @@ class FoldedPlanes:
             lines, width = self.layout.line_count, self.layout.upsampling * (textures.time_rows.width - 1) + 1
             self._upsampled = plane_texture(ctx, self.layout.size)
             self._rows = plane_texture(ctx, (width, lines))
-            self._planes = plane_texture(ctx, self.layout.size, "f2")
+            self._planes = plane_texture(ctx, self.layout.size, folded_dtype(textures.scene))
             self._upsampled.filter = self._rows.filter = moderngl.NEAREST, moderngl.NEAREST
             self._upsample_into, self._fold_into = ctx.framebuffer([self._upsampled]), ctx.framebuffer([self._planes])
         self._time: float | None = None
-        self._is_upsampled = False
+        self._is_upsampled, self._is_checked = False, True
 
     @property
     def memory_bytes(self) -> int:
@@ -56,13 +75,15 @@ class FoldedPlanes:
         return self._planes.dtype
 
     def planes_changed(self) -> None:
-        self._time, self._is_upsampled = None, False
+        self._time, self._is_upsampled, self._is_checked = None, False, False
 
     def time_planes_changed(self) -> None:
-        self._time = None
+        self._time, self._is_checked = None, False
 
     def at(self, time: float) -> moderngl.Texture:
         """Return the planes at a time in [0, 1]."""
+        if not self._is_checked:
+            self._check_dtype()
         if not self._is_upsampled:
             self._textures.planes.use(PLANES_UNIT)
             self._draw_blocks("upsample_plane.glsl", self._upsample_into)
@@ -76,6 +97,18 @@ class FoldedPlanes:
             self._time = time
         return self._planes
 
+    def _check_dtype(self) -> None:
+        """Make folded planes of another type where what has changed in the scene needs it."""
+        dtype, self._is_checked = folded_dtype(self._textures.scene), True
+        if dtype == self.dtype:
+            return
+        for resource in (self._fold_into, self._planes):
+            resource.release()
+        ctx = self._textures.ctx
+        with allocation(ctx, "the folded planes"):
+            self._planes = plane_texture(ctx, self.layout.size, dtype)
+            self._fold_into = ctx.framebuffer([self._planes])
+
     def _draw_blocks(self, name: str, into: moderngl.Framebuffer) -> None:
         """Draw each plane by a shader that takes as uniforms where it lies and which rows go with it."""
         source = self._textures.layout
@@ -85,7 +118,7 @@ class FoldedPlanes:
             upsampled=PLANES_UNIT,
             upsampled_texel=tuple(1 / side for side in into.size),
             folded_rows_texel=tuple(1 / side for side in self._rows.size),
-            largest=LARGEST_HALF,
+            largest=LARGEST_HALF if self.dtype == "f2" else LARGEST_SINGLE,
         )
         for block, written in zip(source.blocks, self.layout.blocks, strict=True):
             lines = self.layout.lines(written)

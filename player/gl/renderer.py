@@ -18,11 +18,12 @@ import numpy as np
 from kpc.format.common.errors import DisplayError
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
+from kpc.format.scene.space import Contraction
 from kpc.player.atlas import Layout, TimeRows
 from kpc.player.cpu import loading, serving
 from kpc.player.cpu.reference import Part, Rendering, appearance_code
 from kpc.player.footprint import texels_per_pixel
-from kpc.player.gl.folding import UPSAMPLING
+from kpc.player.gl.folding import UPSAMPLING, folded_dtype
 from kpc.player.gl.presentation import DisplayMode, Presentation
 from kpc.player.gl.programs import Programs
 from kpc.player.gl.shader_renderer import ShaderRenderer
@@ -41,6 +42,8 @@ MOST_PIXELS = 1 << 22
 COMPUTE_VERSION = 430
 # Pictures until fragment and compute shaders are tried against each other, and pictures that each of them then draws.
 TRIAL_AFTER, TRIALS = 8, 3
+# Samples on a ray that a software driver draws, at most.
+MOST_SAMPLES = 32_000
 # Renderers that are a processor which stands in for a graphics card.
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
 
@@ -54,6 +57,23 @@ def tries_compute(ctx: moderngl.Context) -> bool:
     """Return whether there is a choice between fragment and compute shaders; a processor is never faster by compute
     shaders."""
     return ctx.version_code >= COMPUTE_VERSION and not is_software(ctx)
+
+
+def _refuse_endless(ctx: moderngl.Context, scene: Scene) -> None:
+    """Raise a DisplayError for rays of more samples than loops of software drivers turn: llvmpipe leaves after 65,535
+    turns, of which a sample takes two."""
+    occupied = scene.occupancy.any(axis=0)
+    if not is_software(ctx) or not occupied.any():
+        return
+    shares = [np.ptp(found) + 1 for found in np.nonzero(occupied)[::-1]] / np.array(occupied.shape[::-1])
+    across = float(np.linalg.norm(shares * (scene.aabb[1] - scene.aabb[0])))
+    if isinstance(scene.mapping, Contraction):
+        across = scene.mapping.s_end
+    if across / scene.step > MOST_SAMPLES:
+        raise DisplayError(
+            f"rays of {across / scene.step:,.0f} samples are more than {ctx.info['GL_RENDERER']} can draw "
+            f"({MOST_SAMPLES:,}); kprender --backend reference"
+        )
 
 
 class Renderer:
@@ -89,6 +109,7 @@ class Renderer:
     ) -> None:
         self.ctx, self.scene, self.quality, self.compute = ctx, scene, quality, bool(compute)
         self._pictures_to_trial = TRIAL_AFTER if compute is None and tries_compute(ctx) else math.inf
+        _refuse_endless(ctx, scene)
         self._textures = SceneTextures(ctx, scene)
         self.layout = self._textures.layout
         self._programs = Programs(self._textures)
@@ -161,8 +182,8 @@ class Renderer:
 
     @property
     def plane_dtype(self) -> str:
-        """The type of the planes that shaders look up: "f2" where they are folded, else "f4"."""
-        return "f2" if self.quality.folded and self.scene.is_dynamic else "f4"
+        """The type of the planes that shaders look up: "f4", or where they are folded `folding.folded_dtype`."""
+        return folded_dtype(self.scene) if self.quality.folded and self.scene.is_dynamic else "f4"
 
     @property
     def memory_bytes(self) -> int:

@@ -18,7 +18,7 @@ import pytest
 import torch
 from numba.core.dispatcher import Dispatcher
 
-from gradients import FIELD_KINDS, FieldFunction, backpropagate, random_rays, reference_gradients, translucent_scene
+from gradients import FIELD_KINDS, FieldFunction, random_rays, translucent_scene
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig
@@ -30,6 +30,7 @@ from kpc.encoder.field.render import Rays, render_reference
 from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_prior_gradients
 from kpc.format.container.scene_layout import SAMPLE_LIMIT
 from kpc.player.cpu import reference
+from kpc.tools.bench.stability.gradients import backpropagate, reference_gradients
 from scenes import tiny_scene, with_motion
 
 COLOUR = 1e-4

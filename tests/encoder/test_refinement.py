@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-import gradients
 import kpc.encoder.training.refinement as refinement_module
 from datasets import write_n3dv, write_nerfstudio
-from gradients import backpropagate
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.report import describe_corrections
@@ -35,6 +33,8 @@ from kpc.format.container import scene_io
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import TIME_PLANES, Clip, Scene
 from kpc.format.scene.space import Contraction
+from kpc.tools.bench.stability import gradients
+from kpc.tools.bench.stability.gradients import backpropagate
 from scenes import in_device_coordinates, look_at, tiny_scene, with_motion
 from training_runs import CONFIG, TINY, ignore, torch_twin, trained, trainer
 

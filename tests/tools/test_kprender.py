@@ -74,6 +74,16 @@ def test_without_a_camera_the_scene_shows_its_opening_view(run, tmp_path: Path) 
     assert code == 2 and "--camera up: neither a file nor a camera of the scene, which has left to right" in err
 
 
+def test_cameras_too_far_away_for_float32_are_refused(run, scene_file: Path, tmp_path: Path) -> None:
+    listed = cameras_json(tmp_path / "cameras.json", ["one.png"])
+    document = json.loads(listed.read_text())
+    for row, move in zip(document["frames"][0]["transform_matrix"], (0, 1e4, 0, 0), strict=True):
+        row[3] += move
+    listed.write_text(json.dumps(document))
+    code, _, err = run(scene_file, "--cameras", listed, "-o", tmp_path / "out", "--backend", "reference")
+    assert code == 2 and "a camera is 4,546 times the longest edge" in err and len(err.splitlines()) == 1
+
+
 def test_names_from_a_camera_file_stay_in_the_directory(run, scene_file: Path, tmp_path: Path) -> None:
     names = [
         "../../escape.png",

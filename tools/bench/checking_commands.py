@@ -1,4 +1,4 @@
-"""The subcommands of kpbench that compare with the truth: quality and pictures."""
+"""The subcommands of kpbench that compare with the truth: quality, pictures and stability."""
 
 import argparse
 import sys
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from kpc.format.common import cli
+from kpc.format.common.progress import progress
 from kpc.format.container.groups import Groups
 from kpc.tools.bench import harness
 from kpc.tools.bench.provenance import data_hash
@@ -54,6 +55,14 @@ def add_parsers(kinds: Any) -> None:
             metavar="N",
             help="average blocks of N x N pixels (default: as encoded)",
         )
+
+    stability = kinds.add_parser(
+        "stability",
+        help="every stage against float64, at numbers from small to large",
+        description="Sweep boxes, cameras, clips, planes, mappings, motion, densities, samples and bits from small to "
+        "large, and compare pictures, products and gradients with float64. With --out FILE.json also write FILE.svg.",
+    )
+    stability.set_defaults(measure=_stability)
 
 
 def _quality(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
@@ -110,3 +119,29 @@ def _beginning(kind: str, options: argparse.Namespace, origin: Record) -> tuple[
     record |= {"dataset_sha256": data_hash(folder), "seed": None, "renderer": "cpu"}
     print(f"kpbench: {record['name']}, against {settings['dataset']}", file=sys.stderr)
     return record, quality.Job(options.scene, folder, holdout, downscale, options.test_views)
+
+
+def _stability(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
+    """Yield a record for each sweep; beside --out FILE.json, FILE.svg shows all of them."""
+    harness.encoder()  # reports a missing package before anything is measured
+    import torch
+
+    from kpc.tools.bench.stability import pictures, scenes, stages, sweeps  # need torch
+
+    if options.out is not None:
+        from kpc.tools.bench import plot  # needs matplotlib
+    drawn_by = scenes.opengl_name()
+    if drawn_by is None:
+        print("kpbench: no OpenGL here; the player's renderers are left out", file=sys.stderr)
+    torch.set_num_threads(1)  # pictures are small
+    records = []
+    for sweep in progress([*stages.sweeps(), *pictures.sweeps()], "stability", unit="sweeps"):
+        found = sweeps.run(sweep)
+        record = harness.new_record("stability", Path(scenes.__file__), origin, sweep.settings())
+        record |= {"name": sweep.stage, "seed": 0, "renderer": drawn_by or "cpu"}
+        record |= {"points": found["points"], "passes": found["passes"]}
+        record["repeats"] = [{"max_error": found["max_error"], "worst": found["worst"]}]
+        records.append(record)
+        yield record
+    if options.out is not None:
+        plot.save(plot.stability(records), options.out.with_suffix(".svg"))

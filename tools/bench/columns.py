@@ -114,6 +114,22 @@ def _shares(record: Record) -> str:
     return ", ".join(f"{kind} {share:.0%}" for kind, share in largest if share >= 0.01) or "-"
 
 
+def _admitted(record: Record) -> str:
+    low, high = record["settings"]["admitted"]
+    if high is None:
+        return "all"
+    return f"up to {high:.3g}" if not low else f"{low:.3g} to {high:.3g}"
+
+
+def _passes(record: Record) -> str:
+    """Show the values nearest to those admitted at which the error passes its bound, the least that was tried first."""
+    low, high = record["settings"]["admitted"]
+    below = [value for value in record["passes"] if low is not None and value < low]
+    above = [value for value in record["passes"] if high is not None and value > high]
+    within = [value for value in record["passes"] if value not in below + above]
+    return ", ".join(f"{value:.3g}" for value in (*below[-1:], *within, *above[:1])) or "-"
+
+
 # --- columns
 
 ENCODED: list[Column] = [
@@ -326,6 +342,17 @@ COLUMNS: dict[str, list[Column]] = {
         *_of_parts("SSIM", "ssim", "{:.3f}"),
         *_of_parts("FLIP", "flip", "{:.3f}"),
     ],
+    "stability": [
+        ("stage", _name),
+        ("swept", _setting("axis")),
+        ("admitted", _admitted),
+        ("error of", _setting("error")),
+        ("error", number("max_error", "{:.1e}")),
+        ("by", lambda r: r["repeats"][0]["worst"]),
+        ("passes at", _passes),
+        ("bound", _setting("bound", "{:.1e}")),
+        ("kept by", _setting("kept")),
+    ],
     "decode": [
         ("scene", _name),
         ("segments", number("segments", "{:.0f}")),
@@ -373,6 +400,7 @@ PRINTED: dict[str, tuple[str, ...]] = {
     "entropy": ("scene", "variant", "planes KB", "decoding ms", "file KB", "reading ms"),
     "quality": ("scene", "pictures", "PSNR", "moving PSNR", "FLIP", "flicker"),
     "ceiling": ("dataset", "pictures", "PSNR", "moving PSNR", "still PSNR", "FLIP"),
+    "stability": ("stage", "swept", "admitted", "error", "by", "passes at"),
     "decode": ("scene", "segments", "symbols", "one thread ms", "two threads ms", "slowest segment ms"),
     "scaling": ("by", "amount", "reading s", "training s", "the rest s", "peak MB"),
     "pictures": ("scene", "dataset", "views", "PSNR dB", "moving", "still"),
@@ -395,6 +423,7 @@ TITLES = {
     "decode": "Decoding by the decoder core",
     "scaling": "Encoding by the size of the work",
     "pictures": "Pictures beside truth",
+    "stability": "Numerical stability",
     "quality": "Quality of held-out views, moving and still pixels apart",
     "ceiling": "Frames trained alone, moving and still pixels of the clip apart",
 }

@@ -17,6 +17,7 @@
     kpbench decode room.kpc liam.kpc --out docs/bench/decode.json
     kpbench scaling --repeats 3 --out docs/bench/scaling.json
     kpbench quality room.kpc room --out docs/bench/quality.json
+    kpbench stability --out docs/bench/stability.json
     kpbench compare old.json new.json
     kpbench report docs/bench/*.json -o report.html
     kpbench suite -o records --plan
@@ -88,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
         dest="kind",
         required=True,
         metavar="encode|curve|ablate|step|groups|ceiling|player|stream|window|steady|web|codec|entropy|decode|quality|"
-        "pictures|scaling|compare|report|suite",
+        "pictures|stability|scaling|compare|report|suite",
     )
     for name, (_, help) in APART.items():
         kinds.add_parser(name, add_help=False, help=help)

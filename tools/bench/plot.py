@@ -5,10 +5,11 @@
     python -m kpc.tools.bench.plot docs/bench/groups.json -o docs/groups.svg
     python -m kpc.tools.bench.plot docs/bench/player.json -o docs/player.svg
     python -m kpc.tools.bench.plot docs/bench/quality.json -o docs/quality.svg
+    python -m kpc.tools.bench.plot docs/bench/stability.json -o docs/stability.svg
 
 Records of `kpbench curve` give quality and size against training time, those of `codec` rate against distortion, those
 of `groups` the PSNR of each frame, those of `player` accuracy against frame time, those of `quality` each measure of
-each frame. The suffix of the output chooses SVG,
+each frame, those of `stability` errors against what is swept. The suffix of the output chooses SVG,
 PNG or PDF. Needs the extra `bench`: `pip install ".[bench]"` in a checkout.
 """
 
@@ -26,6 +27,7 @@ from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, UsageError
 from kpc.tools.bench import results
 from kpc.tools.bench.records import Record, median
+from kpc.tools.bench.stability.figure import draw as stability
 from kpc.tools.bench.tables import is_ours
 
 # Panels of the training plot: the key of a repeat, the title, and the unit of the axis.
@@ -257,6 +259,16 @@ def _dots(line: Sequence[Record], key: str) -> list[tuple[float, float]]:
     return [(run["train_s"], run[key]) for run in runs if run.get("train_s") and run.get(key) is not None]
 
 
+# What draws records of a kind; the others are drawn by `curves`.
+DRAWN = {
+    "codec": rate_distortion,
+    "groups": per_frame,
+    "player": quality_levels,
+    "quality": fidelity,
+    "stability": stability,
+}
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
     return cli.run(_command, "plot", argv)
@@ -271,8 +283,7 @@ def _command(argv: list[str]) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="the .svg, .png or .pdf file to write")
     options = parser.parse_args(argv)
     records = results.load(options.records)
-    kinds = {"codec": rate_distortion, "groups": per_frame, "player": quality_levels, "quality": fidelity}
-    draw = kinds.get(records[0]["kind"] if records else "", curves)
+    draw = DRAWN.get(records[0]["kind"] if records else "", curves)
     save(draw(records), options.output)
     print(options.output)
 

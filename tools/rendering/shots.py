@@ -17,6 +17,7 @@ from kpc.format.common.errors import UsageError
 from kpc.format.scene.cameras import Camera, View, load_views
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Clip, Scene
+from kpc.format.scene.space import FARTHEST_CAMERA, edges_away
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.viewpoints import fit_camera, orbit
 
@@ -128,6 +129,7 @@ def _timeline(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bo
     fixed_time: float | None = options.time
 
     def fitted(camera: Camera) -> Camera:
+        _check_distance(scene, camera)
         return camera if options.size is None else fit_camera(camera, *options.size)
 
     if options.path is not None:
@@ -163,6 +165,19 @@ def _timeline(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bo
         return Timeline(1, fps, lambda frame: (camera, _clamped(fixed_time + frame * clip_frames / last_frame)))
     count = math.ceil(clip.frame_count / clip_frames - SLACK) if clip.frame_count > 1 else 1
     return Timeline(count, fps, lambda frame: (camera, _clamped(frame * clip_frames / last_frame)))
+
+
+def _check_distance(scene: Scene, camera: Camera) -> None:
+    """Refuse a camera from which float32 cannot tell samples apart; in contracted space and NDC it can from anywhere.
+
+    Raises:
+        UsageError: the camera is too far away.
+    """
+    if scene.mapping is None and (away := edges_away(scene.aabb, camera.camera_to_world[:3, 3])) > FARTHEST_CAMERA:
+        raise UsageError(
+            f"a camera is {away:,.0f} times the longest edge of the scene's box away from it, where numbers are too "
+            f"coarse (at most {FARTHEST_CAMERA:,.0f}); move it closer and shorten its focal length"
+        )
 
 
 def _clamped(time: float) -> float:

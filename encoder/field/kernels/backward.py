@@ -6,7 +6,7 @@ from numba import prange
 from kpc.encoder.field.kernels.arguments import Gradients
 from kpc.encoder.field.kernels.compilation import bare, inlined, parallel
 from kpc.encoder.field.kernels.geometry import add_ray_gradient, cell_index, inverse_edges, ray_distance
-from kpc.encoder.field.kernels.marching import LIMIT, NEGLIGIBLE, march_ray, new_ray_buffers, shade_ray
+from kpc.encoder.field.kernels.marching import LIMIT, march_ray, negligible_weight, new_ray_buffers, shade_ray
 from kpc.encoder.field.kernels.planes import point_gradient, scatter_motion, scatter_planes, undisplace_gradient
 
 
@@ -31,14 +31,14 @@ def distortion_gradient(buffers, count, volume, factor):
 def decoder_gradient(density, basis, g_log, weight, g_rgb, feature, colour, g_features, g_density, g_basis):
     """Set g_features (F,), and add the gradients of density and basis, of one sample.
 
-    log density = density . (features, 1);  colour_c = sigmoid(basis_c . features)
+    log density = density . (features, 1);  colour_c = sigmoid(basis_c . features), 0 where the sample got none
     """
     F = g_features.size
     for i in range(F):
         g_features[i] = g_log * density[i]
         g_density[i] += g_log * feature[i]
     g_density[F] += g_log
-    if weight > NEGLIGIBLE:
+    if colour[0] + colour[1] + colour[2] > 0:
         for c in range(3):
             g_c = g_rgb[0] if c == 0 else (g_rgb[1] if c == 1 else g_rgb[2])
             g_c *= weight * colour[c] * (np.float32(1.0) - colour[c])
@@ -63,7 +63,7 @@ def backpropagate_ray(
         gradients: `Gradients` of this worker and ray: (n,), (F + 1,), (3, F), (T, Nz, Ny, Nx, 3), (RAY_GRADIENTS,).
         peaks: (Nz, Ny, Nx), raised to the weights of the samples in each cell.
     """
-    inverse = inverse_edges(volume.aabb)
+    inverse, negligible = inverse_edges(volume.aabb), negligible_weight(count)
     if gradients.wants_rays:
         gradients.rays[7], gradients.rays[8], gradients.rays[9] = g_rgb
     behind = g_background  # d loss / d C times the colour that comes from behind sample k
@@ -91,7 +91,7 @@ def backpropagate_ray(
             gradients.density,
             gradients.basis,
         )
-        wants_ray = gradients.wants_rays and weight > NEGLIGIBLE  # as for colours: others hardly move a picture
+        wants_ray = gradients.wants_rays and weight > negligible  # as for colours: others hardly move a picture
         wants_point = wants_ray or gradients.wants_motion
         scatter_planes(planes, gradients.theta, buffers.g_features, buffers, k, wants_point, wants_ray)
         if wants_point:

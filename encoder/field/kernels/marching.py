@@ -25,8 +25,10 @@ END_TRANSMITTANCE = np.float32(TERMINATION)
 # No ray takes more steps, whatever its numbers are, so that every kernel ends and Ctrl-C is heard.
 MOST_STEPS = SAMPLE_LIMIT + 2
 
-# A sample of less weight than this gets no colour: 4096 of them could not make up one and a half 8-bit levels.
+# A sample of less weight than this gets no colour, nor one of so little that all samples of its ray could not make up
+# half of an 8-bit level.
 NEGLIGIBLE = np.float32(1e-4)
+HALF_LEVEL = np.float32(0.5 / 255)
 
 
 @plain
@@ -104,16 +106,22 @@ def march_ray(planes, density, volume, origin, direction, time, jitter, buffers)
     return count, trans
 
 
+@inlined
+def negligible_weight(count):
+    """Return the weight up to which samples of a ray with `count` of them get no colour."""
+    return min(NEGLIGIBLE, HALF_LEVEL / np.float32(max(count, 1)))
+
+
 @bare
 def shade_ray(buffers, count, basis, red, green, blue):
     """Add the samples of a ray after `march_ray` to a colour; keep their colours in the buffers.
 
     C = (red, green, blue) + sum_k w_k sigmoid(basis . features_k),   basis (3, F)
     """
-    F = buffers.g_features.size
+    F, negligible = buffers.g_features.size, negligible_weight(count)
     for k in range(count):
         colour, weight = buffers.colours[k], buffers.weights[k]
-        if weight > NEGLIGIBLE:
+        if weight > negligible:
             for c in range(3):
                 colour[c] = sigmoid(dot(buffers.features[k], basis[c], F))
         else:

@@ -58,7 +58,9 @@ const float ACTIVATION_LIMIT = 65504.0;
 
 // alpha = 1 - exp(-sigma tau); \`tau\` is step / extent, times what the step counts in contracted space.
 float alpha_of(float log_density, float tau) {
-    return 1.0 - exp(-exp(clamp(log_density, -LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT)) * tau);
+    float x = exp(clamp(log_density, -LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT)) * tau;
+    // The difference from 1 of the exponential of a small number is little more than its rounding.
+    return x < 0.01 ? x * (1.0 - x * (0.5 - x / 6.0)) : 1.0 - exp(-x);
 }
 
 vec3 sigmoid(vec3 x) {
