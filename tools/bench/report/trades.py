@@ -434,6 +434,7 @@ COMMANDS = {
     "entropy": "kpbench entropy SCENE.kpc --out entropy.json",
     "decode": "kpbench decode SCENE.kpc --out decode.json",
     "quality": "kpbench quality SCENE.kpc DATASET --out quality.json",
+    "ceiling": "kpbench ceiling DATASET --preset balanced --out ceiling.json",
     "pictures": "kpbench pictures SCENE.kpc DATASET --out pictures.json",
     "stability": "kpbench stability --out stability.json",
 }
