@@ -37,8 +37,23 @@ svg{width:100%;height:auto;border:1px solid var(--line);border-radius:6px;displa
 .wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.9rem}
 th,td{text-align:left;padding:3px 14px 3px 0;border-bottom:1px solid var(--line);white-space:nowrap}
 .grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(130px,1fr));gap:10px}
+.over{position:relative}.over svg{position:absolute;inset:0;height:100%;border:0}
+.check{fill:none;stroke-width:1.5;vector-effect:non-scaling-stroke}
 .grid img{width:100%;border-radius:4px;display:block}
 """
+
+
+@dataclass(frozen=True)
+class Check:
+    """A point in a picture, and where another camera that sees it says that it is.
+
+    Attributes:
+        place: x and y in pixels.
+        line: (N, 2) pixels, its epipolar line; it goes through the point if both cameras were placed rightly.
+    """
+
+    place: tuple[float, float]
+    line: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -52,6 +67,7 @@ class ShownCamera:
         size: width and height in pixels.
         facts: what the table says about it, by column.
         picture: (H, W, 3) uint8, or None.
+        checks: drawn on the picture.
     """
 
     name: str
@@ -60,6 +76,7 @@ class ShownCamera:
     size: tuple[int, int]
     facts: tuple[str, ...] = ()
     picture: np.ndarray | None = None
+    checks: tuple[Check, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,12 +122,17 @@ def write_camera_page(
     if curves:
         parts.append(_curves(curves))
     shown = "".join(
-        f'<figure><img alt="" src="{_jpeg(camera.picture)}"><figcaption>{escape(camera.name)}</figcaption></figure>'
+        f"<figure>{_picture(camera)}<figcaption>{escape(camera.name)}</figcaption></figure>"
         for camera in cameras
         if camera.picture is not None
     )
     if shown:
         parts.append(f'<h2>Pictures</h2><div class="grid">{shown}</div>')
+        if any(camera.checks for camera in cameras):
+            parts.append(
+                "<p>Circles: points that were found. Lines of the same colour: where they lie for the camera that "
+                "shares most points. Each line goes through its circle if cameras were placed rightly.</p>"
+            )
     page = (
         '<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{escape(title)}</title><style>{STYLE}</style><body>{''.join(parts)}</body></html>\n"
@@ -224,6 +246,25 @@ def _curves(curves: Sequence[Curve]) -> str:
         f'<svg viewBox="0 0 {width} {len(curves) * row + 6}" style="min-width:600px">{"".join(drawn)}</svg></div>'
         "<p>Rises and falls stand one below another if the clocks are right.</p>"
     )
+
+
+def _picture(camera: ShownCamera) -> str:
+    """Return the picture of a camera, with its checks."""
+    assert camera.picture is not None
+    image = f'<img alt="" src="{_jpeg(camera.picture)}">'
+    if not camera.checks:
+        return image
+    height, width = camera.picture.shape[:2]
+    drawn = ""
+    for number, check in enumerate(camera.checks):
+        hue = f"stroke:hsl({90 * number + 30} 90% 55%)"
+        line = " ".join(f"{x:.1f},{y:.1f}" for x, y in check.line)
+        x, y = check.place
+        drawn += (
+            f'<polyline class="check" style="{hue}" points="{line}"/>'
+            f'<circle class="check" style="{hue}" cx="{x:.1f}" cy="{y:.1f}" r="{0.022 * width:.1f}"/>'
+        )
+    return f'<div class="over">{image}<svg viewBox="0 0 {width} {height}">{drawn}</svg></div>'
 
 
 def _jpeg(picture: np.ndarray) -> str:

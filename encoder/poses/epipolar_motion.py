@@ -8,7 +8,7 @@ geometry based on line similarity", ICPR 2016, whose lines only know whether any
 
 import numpy as np
 
-from kpc.encoder.datasets.rays import undistort
+from kpc.encoder.poses.epipolar_lines import looks
 from kpc.encoder.poses.motion_sync import Signal, sampled
 from kpc.encoder.poses.structure import PlacedView
 from kpc.encoder.poses.survey import Survey
@@ -24,13 +24,8 @@ LEAST_BASELINE = 1e-6
 
 def directions(view: PlacedView, seen: Survey) -> np.ndarray:
     """Return where the squares of a camera's `changes` look in the world, (rows * columns, 3) float64."""
-    rows, columns = seen.changes.shape[1:]
-    y, x = (np.indices((rows, columns)).reshape(2, -1) + 0.5) * seen.square
-    fl_x, fl_y, cx, cy = view.intrinsics
-    x, y = (x - cx) / fl_x, (y - cy) / fl_y
-    if any(view.distortion):
-        x, y = undistort(x, y, np.array([[*view.distortion, 0, 0, 0, 0]]))
-    return np.stack([x, -y, -np.ones_like(x)], axis=1) @ view.camera_to_world[:3, :3].T
+    y, x = (np.indices(seen.changes.shape[1:]).reshape(2, -1) + 0.5) * seen.square
+    return looks(view, x, y)
 
 
 def sheaves(one: PlacedView, two: PlacedView, rays: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray] | None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from kpc.encoder.datasets.video import read_video
 from kpc.encoder.evaluation.camera_page import PICTURES, Curve, ShownCamera, spread, write_camera_page
+from kpc.encoder.poses.epipolar_lines import checks
 from kpc.encoder.poses.find import Found
 from kpc.encoder.poses.footage import Footage
 from kpc.encoder.poses.instants import frame_times
@@ -32,8 +33,10 @@ def write_page(found: Found, title: str, file: Path) -> None:
         picture = _first_picture(found.footage[number]) if number in with_picture else None
         lens = (1.0, 1.0, 0.5, 0.5) if view is None else view.intrinsics
         size = (1, 1) if view is None else (round(2 * lens[2]), round(2 * lens[3]))
-        cameras.append(ShownCamera(name, None if view is None else view.camera_to_world, lens, size, facts, picture))
-    lines = [
+        pose = None if view is None else view.camera_to_world
+        lines = () if view is None or picture is None else checks(found.structure, number)
+        cameras.append(ShownCamera(name, pose, lens, size, facts, picture, lines))
+    said = [
         f"{found.kind}: {len(views)} of {len(names)} placed, mean reprojection error {found.structure.error:.2f} px"
     ]
     curves = [
@@ -41,7 +44,7 @@ def write_page(found: Found, title: str, file: Path) -> None:
         for one, clock, motion in zip(found.footage, found.clocks, found.motion, strict=False)
         if len(motion) > 2
     ]
-    write_camera_page(file, title, lines, cameras, columns, found.structure.points, curves)
+    write_camera_page(file, title, said, cameras, columns, found.structure.points, curves)
 
 
 def _first_picture(footage: Footage) -> np.ndarray:

@@ -18,6 +18,7 @@ pytest.importorskip("scipy", reason="needs scipy, of the extra poses")
 
 from kpc.encoder.cli import kpposes, read_dataset
 from kpc.encoder.cli.options import parse
+from kpc.encoder.poses.epipolar_lines import LINES
 from kpc.encoder.poses.orientation import looked_at, up_direction
 
 LATE = (0, 7, 0, 3, 12)  # frames
@@ -69,7 +70,8 @@ def test_videos_are_brought_in_step_by_what_moves(document):
 def test_a_page_shows_the_cameras(room, document):
     page = (room.parent / "cameras.html").read_text()
     assert "still rig: 5 of 5 placed" in page
-    assert page.count("<polyline") == page.count("<img") == 5
+    assert page.count('<polyline class="curve"') == page.count("<img") == 5
+    assert page.count('<polyline class="check"') == page.count('<circle class="check"') == 5 * LINES
     assert page.count("<td>motion</td>") == 5
 
 

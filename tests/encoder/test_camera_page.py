@@ -1,6 +1,7 @@
 """The page that shows cameras."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import datasets as make
-from kpc.encoder.evaluation.camera_page import Curve, ShownCamera, write_camera_page, write_page_of_dataset
+from kpc.encoder.evaluation.camera_page import Check, Curve, ShownCamera, write_camera_page, write_page_of_dataset
 
 VOID = ("meta", "img")
 
@@ -70,6 +71,15 @@ def test_everything_is_in_one_file(tmp_path: Path, shown: list[ShownCamera]) -> 
         assert text in read.text
     assert page.count("<polyline") == 2 and page.count("<circle") < 2 * 2600
     assert "nan" not in read.drawn and "inf" not in read.drawn
+
+
+def test_epipolar_lines_are_drawn_on_pictures(tmp_path: Path, shown: list[ShownCamera]) -> None:
+    check = Check((7.0, 9.5), np.array([[1.0, 2.0], [30.5, 20.0]]))
+    write_camera_page(tmp_path / "cameras.html", "x", [], [replace(shown[0], checks=(check, check)), shown[1]])
+    page = (tmp_path / "cameras.html").read_text()
+    assert "Circles: points that were found." in Reader(page).text
+    assert page.count('points="1.0,2.0 30.5,20.0"') == page.count('cx="7.0" cy="9.5"') == 2
+    assert page.count('viewBox="0 0 32 24"') == 1
 
 
 def test_a_dataset_is_shown(tmp_path: Path) -> None:
