@@ -30,7 +30,7 @@ from kpc.player.cpu import reference
 from scenes import VARIANTS, tiny_scene, with_appearances
 from training_runs import TINY
 
-pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding")
+pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding", "rounded")
 
 VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "valid"
 Kpenc = Callable[..., dict[str, Any]]
@@ -209,7 +209,7 @@ def scene_file(tmp_path: Path) -> Path:
     return tmp_path / "scene.kpc"
 
 
-def test_a_file_becomes_smaller(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
+def test_a_file_becomes_smaller(searched: None, scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
     size = scene_file.stat().st_size
     target = int(0.85 * size)
     result = kpenc_says(scene_file, tmp_path / "smaller.kpc", "--target-size", str(target))

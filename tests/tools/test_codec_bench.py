@@ -90,7 +90,7 @@ def scene_file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def few(monkeypatch: pytest.MonkeyPatch, quick_coding: None) -> None:
+def few(monkeypatch: pytest.MonkeyPatch, quick_coding: None, rounded: None) -> None:
     """Run in this process with little to do; `test_separate_processes` covers the process pool."""
 
     def here(jobs: list[codec_bench.Job], views: object, processes: int) -> list[Point | None]:

@@ -40,7 +40,7 @@ GROUPS = str(Path(__file__).parents[2] / "spec" / "vectors" / "valid" / "groups.
 
 
 @pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch, one_thread: None, quick_coding: None) -> None:
+def here(monkeypatch: pytest.MonkeyPatch, one_thread: None, quick_coding: None, rounded: None) -> None:
     """Run in this process with little to do; jobs and results are pickled as for a separate process."""
 
     def isolated(work: Callable[[Any], Any], job: Any) -> Any:
