@@ -88,7 +88,8 @@ def test_steps_are_commands_whose_needs_come_first(steps: list[Step], capsys: py
 def test_generated_scenes_take_less_than_an_hour_and_make_every_kind() -> None:
     steps = suite_steps.generated(HOUR)
     assert sum(step.minutes for step in steps) <= 60
-    assert {COMMANDS.get(kind, "").split()[1] for kind in COMMANDS} - {step.words[0] for step in steps} == {"stability"}
+    made = {step.words[0] for step in steps}
+    assert {command.split()[1] for command in COMMANDS.values()} - made == {"ceiling"}  # it takes an hour by itself
     timed = {"player", "stream", "window", "step", "scaling", "decode"}
     assert all("--repeats" in step.words for step in steps if step.words[0] in timed)
 

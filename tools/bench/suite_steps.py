@@ -87,7 +87,7 @@ HOUR = Effort(
     long=("--frames", "90", "--cameras", "8", "--size", "128x96", "--samples", "1"),
     group="2.5s",
     preset="balanced",
-    curves={"fast": "0.5,1", "balanced": "1.5"},
+    curves={"fast": "1", "balanced": "1.5"},
     encode=(),
     steps=(200, 50, 200),
     frames=(20, 1000),
@@ -137,7 +137,7 @@ def generated(effort: Effort) -> list[Step]:
         Step(
             f"curve-{preset}",
             ("curve", DEFAULT, "--preset", preset, "--minutes", minutes),
-            {"draft": 3, "fast": 4, "balanced": 3}[preset],
+            {"draft": 3, "fast": 2.5, "balanced": 3}[preset],
             ("scene",),
         )
         for preset, minutes in effort.curves.items()
@@ -165,6 +165,7 @@ def generated(effort: Effort) -> list[Step]:
         Step("step", ("step", DEFAULT, "--preset", effort.preset, "--repeats", effort.repeats), 3, ("scene",)),
         *_of_file("", f"{main}.kpc", "encode", effort.frames, effort.repeats),
         Step("codec", ("codec", f"{coded}.kpck", "--dataset", DEFAULT), 4, ("scene", "encode-draft")),
+        Step("stability", ("stability",), 1),
         *_of_truth("", DEFAULT, f"{main}.kpc", ("scene", "encode"), effort.repeats),
     ]
     return [replace(step, minutes=round(step.minutes * effort.minutes, 2)) for step in steps]
@@ -189,6 +190,7 @@ def of_scene(name: str) -> list[Step]:
         *encodings,
         Step(f"curve-{name}", curve, 45),
         Step(f"ablate-{name}", ("ablate", name, "--preset", "fast", "--steps", "1000"), 60),
+        Step(f"ceiling-{name}", ("ceiling", name, "--preset", "balanced"), 60),
         Step(f"step-{name}", ("step", name, "--repeats", REPEATS), 2),
         *_of_file(f"-{name}", f"{main}.kpc", encode, (60, 10_000)),
         Step(f"codec-{name}", ("codec", f"{main}.kpck", "--dataset", name, "--ablate"), 90, (encode,)),

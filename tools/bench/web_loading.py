@@ -74,11 +74,17 @@ def measure(source: Path) -> dict[str, Record]:
 
 
 def splats_of(scene: Scene, count: int) -> np.ndarray:
-    """Return at most `count` Gaussians on the surfaces that the scene's cameras see at the beginning: (N,) SPLAT."""
+    """Return at most `count` Gaussians on the surfaces that the scene's cameras see at the beginning: (N,) SPLAT.
+
+    Raises:
+        KpcError: there is no surface.
+    """
     cameras = [fit_camera(camera, *PICTURE_SIZE) for camera in Rig.of(scene).cameras]
     spacing = scene.extent * SPACING
     cloud = surface_points(((camera, render(scene, camera, 0.0)) for camera in cameras), scene.aabb, spacing)
     chosen = np.random.default_rng(0).permutation(len(cloud.points))[:count]
+    if not len(chosen):
+        raise KpcError("the scene has no surface that its cameras see; train it longer")
     splats = np.zeros(len(chosen), SPLAT)
     splats["place"] = cloud.points[chosen]
     # So wide that those that are left cover what all did.
