@@ -1,5 +1,6 @@
 """Exceptions of commands become an exit code and one line, or are bugs with a traceback."""
 
+import argparse
 import errno
 import importlib
 import importlib.metadata
@@ -146,3 +147,16 @@ def test_a_pipe_is_refused_rather_than_waited_for(tmp_path: Path, capsys: pytest
     os.mkfifo(tmp_path / "scene.kpc")
     assert kpinfo.main([str(tmp_path / "scene.kpc")]) == 1
     assert "scene.kpc: is a pipe" in capsys.readouterr().err
+
+
+def test_frame_rates_may_be_fractions() -> None:
+    rate = cli.frame_rate(0.1, 240)
+    assert rate("24000/1001") == 24000 / 1001 and rate("29.97") == 29.97
+    for text in ("24000/0", "1/1001", "-24/1", "24/", "1e3/7", "nan"):
+        with pytest.raises(argparse.ArgumentTypeError, match=r"is not a frame rate from 0\.1 to 240"):
+            rate(text)
+
+
+def test_a_dash_is_no_file() -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="is no file"):
+        cli.file_name("-")

@@ -29,6 +29,7 @@ from kpc.encoder.training.refinement import with_corrections
 from kpc.format.common import cli
 from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.container import groups, scene_io
+from kpc.format.container.metadata_options import TEXTS
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Clip
 from kpc.format.scene.space import Contraction
@@ -159,9 +160,13 @@ def _read_finished(path: Path, options: Options) -> dict[str, Any]:
 
 def _fingerprint(options: Options) -> dict[str, str]:
     """Return all options that the result depends on, by their names on the command line, as text."""
-    without = ("resume", "keep", "preview", "trade", "cache")
-    plain = {name: str(value) for name, value in vars(options).items() if name not in without}
-    names = {f"--{name.removesuffix('_s').replace('_', '-')}": value for name, value in plain.items()}
+    without = ("resume", "keep", "preview", "trade", "cache", "members")
+    given = {name: value for name, value in vars(options).items() if name not in without}
+    given |= {name: options.members.get(name) for name in TEXTS}
+    names = {
+        f"--{name.removesuffix('_s').replace('_', '-')}": "the default" if value is None else str(value)
+        for name, value in given.items()
+    }
     return names | {"the target": "{} {:g}".format(*options.trade.bound)}
 
 

@@ -77,7 +77,8 @@ def describe_model(trainer: Trainer) -> str:
 def describe_time_rows(config: TrainConfig, dataset: Dataset, found: TimeResolution | None) -> str:
     """Describe the temporal resolution of the planes, and why it was chosen."""
     rows = time_rows(dataset.clip.frame_count, config.frames_per_row)
-    text = f"time: {rows} rows, one for {config.frames_per_row:g} of {dataset.clip.frame_count} frames"
+    each = "each" if config.frames_per_row == 1 else f"every {config.frames_per_row:g}"
+    text = f"time: {rows} rows, one for {each} of {dataset.clip.frame_count} frames"
     if found is None:
         return f"{text} (the preset's)"
     return f"{text}: error {found.error:.3f} between rows, {config.time_tolerance:g} allowed"
@@ -164,7 +165,7 @@ def _print_encode(result: dict[str, Any], options: Options) -> None:
         print(f"{len(result['groups'])} groups: " + ", ".join(_describe_group(group) for group in result["groups"]))
     print(
         f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps) "
-        f"and coding {result['coding_s']:.0f} s"
+        f"and coding {result['coding_s']:.0f} s; the rest is reading, testing and, the first time, compiling"
     )
     if result["coding_s"] > result["train_s"]:
         parameters = f"{result['parameters']:,} parameters"

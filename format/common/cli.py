@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import errno
-import functools
 import io
 import json
 import math
@@ -185,9 +184,11 @@ def input_path(text: str) -> Path:
 
 
 def file_name(text: str) -> str:
-    """Take a path or an address as it is; refuse an empty one, which as a path is the working directory."""
+    """Take a path or an address as it is; refuse an empty one, which as a path is the working directory, and "-"."""
     if not text:
         raise argparse.ArgumentTypeError("the name is empty")
+    if text == "-":
+        raise argparse.ArgumentTypeError("'-' is no file; files are neither read from stdin nor written to stdout")
     return text
 
 
@@ -228,9 +229,16 @@ def time_s(text: str) -> float:
 
 
 def frame_rate(low: float, high: float) -> Callable[[str], float]:
-    """Return a parser of frame rates from `low` to `high` frames per second."""
+    """Return a parser of frame rates from `low` to `high` frames per second, fractions such as "24000/1001", too."""
 
-    return functools.partial(number_within, low=low, high=high, name="a frame rate")
+    def parse(text: str) -> float:
+        above, slash, below = text.partition("/")
+        if slash and above.isdecimal() and below.isdecimal() and int(below) > 0:
+            number_within(str(int(above) / int(below)), low, high, "a frame rate")
+            return int(above) / int(below)
+        return number_within(text, low, high, "a frame rate")
+
+    return parse
 
 
 def number_within(text: str, low: float, high: float, name: str = "a number") -> float:

@@ -167,14 +167,16 @@ def differences(parts: list[Metadata]) -> list[str]:
     return _differing([part.document for part in parts], merged(parts).document)
 
 
-def _differing(documents: list[Mapping[str, Any]], kept: Mapping[str, Any], of: str = "") -> list[str]:
+def _differing(documents: list[Mapping[str, Any]], kept: Mapping[str, Any], are_options: bool = False) -> list[str]:
     found = []
     for name in dict.fromkeys(name for document in documents for name in document):
         if name in PARTLY_AGREED:
             inner = [document.get(name, {}) for document in documents]
-            found += _differing(inner, kept.get(name, {}), "option " if name == "options" else "")
+            found += _differing(inner, kept.get(name, {}), name == "options")
+        elif name not in kept and are_options:
+            found.append("--" + name.removesuffix("_s").removesuffix("_db").replace("_", "-"))
         elif name not in kept:
-            found.append(of + WORDS.get(name, name).replace("_", " "))
+            found.append(WORDS.get(name, name).replace("_", " "))
     return found
 
 

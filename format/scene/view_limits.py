@@ -108,7 +108,7 @@ def find_view(scene: Scene, look: Look) -> tuple[Opening | None, ViewLimits | No
     ahead = [(rig.focus - camera.camera_to_world[:3, 3]) @ -camera.camera_to_world[:3, 2] for camera in scene.cameras]
     if len(eyes) < 3 or np.mean(np.array(ahead) > 0) < 0.9:  # cameras that look outwards have no focus
         return None, None
-    with Progress("finding view limits", USUAL_VIEWS, "views") as bar:
+    with Progress("finding the opening view and limits", USUAL_VIEWS, "views") as bar:
 
         def counted(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
             bar.extend(1)

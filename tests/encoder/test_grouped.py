@@ -217,8 +217,8 @@ def test_an_interrupted_run_resumes_in_its_group_to_the_same_file(videos, tmp_pa
         assert encode(videos, output, *every) == 130
     err = capsys.readouterr().err
     assert "stopped at step 4" in err and "group-0001" in err and not output.exists()
-    assert encode(videos, output, *every, "--resume", "--seed", "5") == 1
-    assert "other settings (--seed was 0, is 5)" in capsys.readouterr().err
+    assert encode(videos, output, *every, "--resume", "--seed", "5", "--title", "Zwölf") == 1
+    assert "other settings (--seed was 0, is 5, --title was the default, is Zwölf)" in capsys.readouterr().err
     assert encode(videos, output, *every, "--resume") == 0
     err = capsys.readouterr().err
     assert "group-0000.kpc: is finished already" in err and "resumed at step 4" in err

@@ -151,7 +151,7 @@ def test_the_result_is_printed(run: Kpenc, sets: Path, monkeypatch: pytest.Monke
     assert previewed[0] < previewed[-1] == 72
     assert code == 0 and "displaced by a motion grid of 11x11x11 nodes" in err
     assert "colour: view-independent, as trained\nchannels kept: " in err
-    assert "time: 2 rows, one for 4 of 5 frames (the preset's" in err
+    assert "time: 2 rows, one for every 4 of 5 frames (the preset's" in err
     assert all(
         words in out
         for words in (
@@ -174,16 +174,13 @@ def test_time_rows_are_as_far_apart_as_motion_allows(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tolerance: float, rows: int, why: str
 ) -> None:
     """There are four frames; a resumed run finds the same number of rows."""
+    each = {2: "every 2", 3: "every 1.5", 4: "each"}[rows]
     config = replace(TINY, time_tolerance=tolerance, frames_per_row=1.5)
     monkeypatch.setitem(PRESETS, "draft", config)
     for options in (("--keep",), ("--resume",)):
         code, _, err = run(sets / "n3dv", "--steps", "2", *options)
         (said,) = [line for line in err.splitlines() if line.startswith("time: ")]
-        assert (
-            code == 0
-            and f"time: {rows} rows, one for {4 / rows if rows != 3 else 1.5:g} of 4 frames" in said
-            and why in said
-        )
+        assert code == 0 and f"time: {rows} rows, one for {each} of 4 frames" in said and why in said
         assert len(scene_io.read(tmp_path / "out.kpc").scales[0]["xt"].symbols) == rows
     assert "resumed at step 2" in err
 

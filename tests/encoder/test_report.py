@@ -21,5 +21,5 @@ def test_the_closing_lines(capsys: pytest.CaptureFixture[str], coding_s: float, 
     print_result(RESULT | {"coding_s": coding_s}, Options(Path("clip"), Path("out.kpc")), as_json=False)
     out = capsys.readouterr().out
     assert out.startswith("out.kpc: held-out PSNR 30.00 dB (moving 25.12, still 33.00), SSIM 0.9000 over 4 of 30 pic")
-    assert f"of which training 50 s (300 steps) and coding {coding_s:.0f} s\n" in out
+    assert f"of which training 50 s (300 steps) and coding {coding_s:.0f} s; the rest is reading" in out
     assert ("coding took longer than training" in out and "all 80,000 parameters are coded" in out) == why

@@ -103,7 +103,7 @@ def test_merging_keeps_the_options_that_all_parts_share_and_names_the_others():
         for title, options in (("One", {"steps": 6000}), ("Other", {"steps": 8000, "downscale": 2}))
     )
     assert merged([one, other]).provenance["options"] == {"max_loss_db": 0.15}
-    assert differences([one, other]) == ["title", "option steps", "option downscale"]
+    assert differences([one, other]) == ["title", "--steps", "--downscale"]
     assert differences([one, one]) == [] and "held-out quality" in differences([one, Metadata()])
 
 

@@ -131,3 +131,13 @@ def test_the_input_is_not_overwritten_and_two_cameras_give_no_limits(folder, cap
     edit(folder, "--view-limits", "auto", scene="two.kpc", code=2)
     assert "three cameras" in capsys.readouterr().err
     assert not read(scene).metadata
+
+
+def test_what_changes_nothing_is_said_or_refused(folder, tmp_path, capsys):
+    copy = edit(folder)
+    assert "there is nothing to change" in capsys.readouterr().err
+    assert copy.read_bytes() == (folder / "scene.kpc").read_bytes()
+    save(replace(tiny_scene(dynamic=False), cameras=()), tmp_path / "still.kpc")
+    for option in ("--fps", "--speed"):
+        assert kpedit.main([str(tmp_path / "still.kpc"), "-o", str(tmp_path / "out.kpc"), option, "2"]) in (1, 2)
+        assert "the scene is static" in capsys.readouterr().err

@@ -53,7 +53,8 @@ def add_parsers(kinds: Any) -> None:
     decode = kinds.add_parser(
         "decode",
         help="how long the decoder core takes",
-        description="Decode all plane segments of each scene on one thread and on two, once everything is loaded.",
+        description="Decode all plane segments of each scene on one thread and on two, once everything is loaded. "
+        "A group of a clip is a scene of its own: decode the files that were joined.",
     )
     harness.add_scenes(decode)
     harness.add_repeats([decode])

@@ -96,6 +96,8 @@ def _parser() -> argparse.ArgumentParser:
     for module in (encoding_commands, playing_commands, coding_commands, checking_commands, scaling):
         module.add_parsers(kinds)
     for kind in kinds.choices.values():
+        if kind.add_help:  # others parse their options themselves
+            cli.add_version_option(kind)
         kind.add_argument(
             "--out", type=cli.output_file(".json"), metavar="JSON", help="write the records here instead of to stdout"
         )

@@ -51,10 +51,14 @@ def _command(argv: list[str]) -> None:
         raise UsageError(f"{options.output}: is the input, too; choose another output with -o")
     cli.check_writable(options.output)
     edits, groups = _edits_from(options), Groups(options.scene)
+    if groups.clip.frame_count == 1 and (edits.speed is not None or edits.fps is not None):
+        raise UsageError("--fps, --speed: the scene is static; it has no frames to show at another rate")
     if edits.speed is not None and has_sound(groups):
         print("kpedit: the sound is left out, since it belongs to the speed of the source", file=sys.stderr)
     metadata = _edited_metadata(groups.metadata(), options, edits.placement)
     if not edits.any:
+        if metadata.document == groups.metadata().document:
+            print("kpedit: there is nothing to change; the output is a copy of the source", file=sys.stderr)
         size, kept_s = save(with_metadata(options.scene, metadata), options.output), None
     else:
         size, kept_s = edit(options.scene, options.output, edits, metadata)
