@@ -143,7 +143,7 @@ def test_the_reported_loss_is_that_of_pictures(spare: float) -> None:
     assert before - fidelity(pruned.scene) == pytest.approx(pruned.loss_db, abs=1e-3)
 
 
-def test_pruning_and_quantisation_together_stay_within_the_limit() -> None:
+def test_pruning_and_quantisation_together_stay_within_the_limit(rounded: None) -> None:
     scene = redundant(directed(tiny_scene(scales=3, resolution=(48, 40, 32)), 0.03))
     rays = rays_of(scene)
     numbers = [{name: np.arange(1.0, 9.0) for name in scale} for scale in scene.scales]
@@ -162,7 +162,7 @@ def test_pruning_and_quantisation_together_stay_within_the_limit() -> None:
     assert fidelity(scene) - fidelity(coded.scene.dequantise()) == pytest.approx(coded.loss_db, abs=1e-3)
 
 
-def test_for_a_target_size_pruning_takes_a_share_of_its_loss() -> None:
+def test_for_a_target_size_pruning_takes_a_share_of_its_loss(rounded: None) -> None:
     """The loss is that with pruning, not that of the unpruned model."""
     scene = redundant(directed(tiny_scene(scales=3, resolution=(48, 40, 32)), 0.03))
     rays = rays_of(scene)

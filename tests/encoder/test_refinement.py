@@ -293,6 +293,7 @@ def test_cameras_that_were_found_are_refined(
     assert options.refine_of(dataset)[0] == options.config(dataset).refine == found
 
 
+@pytest.mark.usefixtures("quick_coding", "rounded")
 def test_kpenc_refines_cameras_as_asked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
