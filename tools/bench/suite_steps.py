@@ -97,8 +97,8 @@ HOUR = Effort(
 )
 QUICK = Effort(
     scene=("--frames", "6", "--cameras", "4", "--size", "48x36", "--samples", "1"),
-    long=("--frames", "12", "--cameras", "4", "--size", "48x36", "--samples", "1"),
-    group="0.5s",
+    long=("--frames", "24", "--cameras", "4", "--size", "48x36", "--samples", "1"),
+    group="1s",
     preset="draft",
     curves={"draft": "0.02,0.05"},
     encode=("--steps", "30", "--test-views", "2"),
