@@ -13,7 +13,7 @@ from kpc.encoder.poses.motion_sync import Signal, sampled
 from kpc.encoder.poses.structure import PlacedView
 from kpc.encoder.poses.survey import Survey
 
-# Sheaves of epipolar lines that are told apart.
+# Sheaves of epipolar lines, each with a motion of its own.
 SHEAVES = 24
 # They move by themselves, so that each frame counts three times: so counted, no sure offset of some hundreds that were
 # measured was wrong.
