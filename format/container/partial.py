@@ -45,6 +45,8 @@ class SegmentedPlane:
         return self.shape[0]
 
     def __getitem__(self, row: int) -> np.ndarray:
+        if not 0 <= row < len(self):
+            raise IndexError(row)  # which ends a loop over all rows
         start = self._starts[bisect_right(self._starts, int(row)) - 1]
         symbols = self._segments.get(start)
         return (
