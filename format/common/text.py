@@ -7,6 +7,7 @@ surrogates (PEP 383): with them a file is found, but they can be neither printed
 import codecs
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -17,6 +18,9 @@ _BYTE_ORDER_MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
+
+# Names that a message lists.
+NAMES_SHOWN = 8
 
 
 def open_text(path: str | os.PathLike[str]) -> TextIO:
@@ -33,6 +37,18 @@ def open_text(path: str | os.PathLike[str]) -> TextIO:
 def valid_unicode(text: str | os.PathLike[str]) -> str:
     """Return text with a replacement character (U+FFFD) for each surrogate."""
     return re.sub("[\ud800-\udfff]", "\ufffd", os.fspath(text))
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless it is one."""
+    return f"{count:,} {noun}" + "s" * (count != 1)
+
+
+def first_names(names: Sequence[str], command: str = "kpinfo --json") -> str:
+    """Return the first NAMES_SHOWN names for a message, and how many more the given command lists."""
+    shown = ", ".join(names[:NAMES_SHOWN])
+    more = len(names) - NAMES_SHOWN
+    return f"{shown} ({more:,} more; {command} lists all)" if more > 0 else shown
 
 
 def one_line(text: str) -> str:

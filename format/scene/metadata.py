@@ -4,6 +4,7 @@ All of it is optional. A file holds it as a JSON object (spec/kpc-format.md, "me
 checked by `kpc.format.container.metadata_chunk`; members that this version does not know are kept.
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -90,6 +91,23 @@ class Metadata:
         """Return a name for each camera of a rig, their numbers from 0 on where the file does not name them all."""
         names = self.camera_names
         return names if len(names) == cameras else tuple(str(number) for number in range(cameras))
+
+    def camera_number(self, text: str, cameras: int) -> int | None:
+        """Return which camera of a rig a user means: the one of that name, or else the one of that number.
+
+        A number is written without leading zeros; "0003" is a name.
+
+        Args:
+            text: a name, or a number from 0 on.
+            cameras: of the rig.
+
+        Returns:
+            The number, which may be too large; None where the text is neither a name nor a number.
+        """
+        names = self.names_of(cameras)
+        if text in names:
+            return names.index(text)
+        return int(text) if re.fullmatch("0|[1-9][0-9]{0,8}", text) else None
 
     @property
     def provenance(self) -> Mapping[str, Any]:

@@ -20,12 +20,14 @@ corner-aligned: u in [0, 1] is read at u * (size - 1). Density is per longest ed
 """
 
 import itertools
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import first_names
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.sound import Sound
@@ -251,17 +253,19 @@ class Scene:
     def appearance(self, name: str) -> np.ndarray:
         """Return the code of the appearance called `name`, (H,) float32.
 
+        A name may lack its suffix, such as .jpg, where no other appearance has the same name without.
+
         Raises:
-            UsageError: there is none of that name; the message lists some that exist.
+            UsageError: there is none of that name, or there are several; the message lists some that exist.
         """
-        for appearance in self.appearances:
-            if appearance.name == name:
-                return appearance.code
+        for meant in (lambda known: known == name, lambda known: os.path.splitext(known)[0] == name):
+            codes = [appearance.code for appearance in self.appearances if meant(appearance.name)]
+            if len(codes) == 1:
+                return codes[0]
         if not self.appearances:
             raise UsageError(f"appearance {name!r}: the scene has no appearances; render it without one")
-        known = ", ".join(appearance.name for appearance in self.appearances[:8])
-        more = ", ..." if len(self.appearances) > 8 else ""
-        raise UsageError(f"appearance {name!r}: the scene has no such appearance; choose one of {known}{more}")
+        known = first_names([appearance.name for appearance in self.appearances])
+        raise UsageError(f"appearance {name!r}: the scene has no such appearance; choose one of {known}")
 
     def interpolate_appearance(self, first: str, second: str, share: float) -> np.ndarray:
         """Return the code (1 - share) first + share second, (H,) float32, for share in [0, 1].

@@ -52,6 +52,22 @@ def test_metadata_comes_back_whole_in_every_way_of_reading():
     assert groups.load(data).metadata == METADATA
 
 
+@pytest.mark.parametrize(
+    ("names", "text", "number"),
+    [
+        (["0019", "0003", "1"], "0003", 1),
+        (["0019", "0003", "1"], "1", 2),
+        (["0019", "0003", "1"], "0", 0),
+        (["0019", "0003", "1"], "7", 7),
+        (["0019", "0003", "1"], "0002", None),
+        (["0019", "0003", "1"], "left", None),
+        ([], "2", 2),
+    ],
+)
+def test_the_name_of_a_camera_wins_over_its_number(names: list[str], text: str, number: int | None) -> None:
+    assert Metadata({"camera_names": names}).camera_number(text, 3) == number
+
+
 def test_a_file_without_metadata_has_no_such_chunk():
     data = encoded(Metadata())
     assert "meta" not in {entry.kind for entry in SceneReader(data).index}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from kpc.format.common import cli
-from kpc.format.common.text import open_text, valid_unicode
+from kpc.format.common.text import counted, first_names, open_text, valid_unicode
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-32"])
@@ -23,6 +23,13 @@ def test_other_encodings_keep_their_bytes(tmp_path: Path) -> None:
     (tmp_path / "x.txt").write_bytes(b"caf\xe9\n")
     with open_text(tmp_path / "x.txt") as file:
         assert os.fsencode(file.read()) == b"caf\xe9\n"
+
+
+def test_numbers_and_names_in_messages() -> None:
+    assert (counted(1, "frame"), counted(0, "frame"), counted(1200, "frame")) == ("1 frame", "0 frames", "1,200 frames")
+    names = [str(number) for number in range(10)]
+    assert first_names(names[:8]) == "0, 1, 2, 3, 4, 5, 6, 7"
+    assert first_names(names, "--json") == "0, 1, 2, 3, 4, 5, 6, 7 (2 more; --json lists all)"
 
 
 def test_valid_unicode() -> None:

@@ -153,9 +153,8 @@ def test_a_scene_with_appearances(tmp_path, capsys):
     write(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]), path)
     assert kpinfo.main([str(path), "--verify"]) == 0
     page = capsys.readouterr().out
-    assert (
-        "appearances 11: 00.jpg, 01.jpg" in page and "07.jpg, ..." in page and "08.jpg" not in page and "appe" in page
-    )
+    assert "appearances 11: 00.jpg, 01.jpg" in page and "08.jpg" not in page and "appe" in page
+    assert "07.jpg (3 more; --json lists all)" in " ".join(page.split())
     assert kpinfo.main([str(path), "--json"]) == 0
     assert scene_of(capsys)["appearances"] == [*names]
     data = bytearray(path.read_bytes())

@@ -71,7 +71,7 @@ def test_without_a_camera_the_scene_shows_its_opening_view(run, tmp_path: Path) 
     assert run(*still, tmp_path / "c.png", "--camera", 1)[0] == 0
     assert (tmp_path / "b.png").read_bytes() == (tmp_path / "c.png").read_bytes()
     code, _, err = run(*still, tmp_path / "d.png", "--camera", "up")
-    assert code == 2 and "--camera up: neither a file nor a camera of the scene, which has left to right" in err
+    assert code == 2 and "--camera up: neither a file nor a camera of the scene, which has left, right" in err
 
 
 def test_cameras_too_far_away_for_float32_are_refused(run, scene_file: Path, tmp_path: Path) -> None:
@@ -332,7 +332,7 @@ def test_the_dynamic_map_is_the_same_from_both_backends(run, scene_file: Path, t
 @pytest.fixture(scope="module")
 def varied_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("appearances") / "varied.kpc"
-    scene = with_appearances(tiny_scene(4), ("dawn.jpg", "5:00 pm", "a/b.jpg", "x:y:0.5"))
+    scene = with_appearances(tiny_scene(4), ("dawn.jpg", "5:00 pm", "a/b.jpg", "x:y:0.5", "n.jpg", "n.png"))
     write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]), path)
     return path
 
@@ -343,9 +343,10 @@ def varied_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ("dawn.jpg", 0, 0, 0),
         ("x:y:0.5", 3, 3, 0),
+        ("dawn", 0, 0, 0),
         ("dawn.jpg:5:00 pm:0.3", 0, 1, 0.3),
         ("5:00 pm:a/b.jpg:1", 1, 2, 1.0),
-        ("x:y:0.5:dawn.jpg:0.75", 3, 0, 0.75),
+        ("x:y:0.5:dawn:0.75", 3, 0, 0.75),
     ],
 )
 def test_appearances_by_name_and_interpolated(
@@ -370,6 +371,7 @@ def test_appearances_by_name_and_interpolated(
     [
         ("dusk.jpg", "'dusk.jpg'"),
         ("", "''"),
+        ("n", "'n'"),
         ("dawn.jpg:dusk.jpg", "'dawn.jpg:dusk.jpg'"),
         ("dawn.jpg:dusk.jpg:0.5", "'dusk.jpg'"),
         ("dawn.jpg:a/b.jpg:1.5", "not a share"),
@@ -414,7 +416,8 @@ def test_unknown_appearances_are_refused(
             (["{scene}", "--time", "0", "-o", f"{{dir}}/x{suffix}"], 2, f"{suffix} is not written")
             for suffix in (".gif", ".webp", ".tiff", ".avi", ".MXF", ".v2")
         ),
-        *((["{scene}", "--time", "0", "-o", name], 2, "is no name") for name in ("-", "{dir}/.png", "{dir}/x.")),
+        (["{scene}", "--time", "0", "-o", "-"], 2, "is no file"),
+        *((["{scene}", "--time", "0", "-o", name], 2, "is no name") for name in ("{dir}/.png", "{dir}/x.")),
         (["{scene}", "--time", "0", "-o", "{folder}"], 2, "film.mp4: is a folder"),
         (["{scene}", "--time", "0", "--format", "exr", "-o", "{dir}/x.png"], 2, "contradicts .png"),
         (["{scene}", "--time", "0", "--format", "png", "-o", "{dir}/x.mp4"], 2, "contradicts .mp4"),

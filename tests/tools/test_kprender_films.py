@@ -4,6 +4,7 @@ import argparse
 import itertools
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,14 @@ import pytest
 import kpc
 from kpc.format.common.errors import MediaError
 from kpc.format.common.images import read_image
+from kpc.format.scene.scene import Clip
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
 from kpc.tools.cli import kprender
 from kpc.tools.rendering import content, pictures, resuming
 from kpc.tools.rendering.options import parser
 from kpc.tools.rendering.resuming import RECORD
-from kpc.tools.rendering.shots import shots_of
+from kpc.tools.rendering.shots import rate_note, shots_of
 from scenes import tiny_scene
 
 SIZE = ("--size", "16x12", "--backend", "reference")
@@ -78,6 +80,21 @@ def test_films_last_as_long_as_the_clip(
 
 
 @pytest.mark.parametrize(
+    ("clip", "words", "rate", "note"),
+    [
+        (Clip(3, 0.4), [], 0.4, None),
+        (Clip(3, 500.0), [], 240.0, "the clip's 500 fps are beyond 0.001 to 240; 240 fps are used"),
+        (Clip(3, 500.0), ["--fps", "100"], 100.0, None),
+        (Clip(1, 0.4), [], 1.0, None),
+    ],
+)
+def test_a_clip_keeps_its_rate_or_a_line_says_so(clip: Clip, words: list[str], rate: float, note: str | None) -> None:
+    options = parser().parse_args(["x.kpc", "-o", "x", *words])
+    scene = replace(tiny_scene(4), clip=clip)
+    assert shots_of(scene, clip, options, is_film=True).fps == rate and rate_note(clip, options) == note
+
+
+@pytest.mark.parametrize(
     ("words", "message"),
     [
         (["--from", 2], "the last frame is at 1.00 s"),
@@ -85,6 +102,9 @@ def test_films_last_as_long_as_the_clip(
         (["--from", 0.5, "--to", 0.4], "no frame lies"),
         (["--frames", "5-11"], "the last frame is 10"),
         (["--frames", "4-2"], "range of frames"),
+        (["--frames", "4-6", "--from", 0.1], "--frames chooses frames"),
+        (["--frames", "4-6", "--to", "0s"], "--frames chooses frames"),
+        (["--diagnose", "both"], "'both' is neither static nor dynamic"),
         (["--time", 0.5, "--frames", "0-3"], "--time stops the clip"),
         (["--time", 0.5, "--from", 0.1, "--to", 0.3], "--time stops the clip"),
         (["-o", ""], "the name is empty"),
@@ -295,7 +315,7 @@ def test_ctrl_c_leaves_whole_frames_only(
 def test_an_odd_size_is_padded_and_said(run: Run, scene_file: Path, tmp_path: Path) -> None:
     words = [scene_file, "--frames", "0-1", "--size", "33x17", "--backend", "reference"]
     code, printed, notes = run(*words, "-o", tmp_path / "x.mp4")
-    assert code == 0 and "padded to 34x18" in printed and "needs even sides" in notes
+    assert code == 0 and "2 frames at 10 fps, 33x17 (padded to 34x18), in" in printed and "needs even sides" in notes
     code, printed, notes = run(*words, "-o", tmp_path / "x.mov", "--background", "transparent")
     assert code == 0 and "(padded" not in printed and "33x17" in printed
 

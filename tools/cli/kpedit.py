@@ -26,6 +26,7 @@ import numpy as np
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import counted
 from kpc.format.common.version import VERSION
 from kpc.format.container.clip_sound import has_sound
 from kpc.format.container.groups import Groups, load
@@ -141,7 +142,8 @@ def _changed_time(options: argparse.Namespace, kept_s: tuple[float, float] | Non
     is_widened = not Groups(options.scene).is_single
     part = "" if kept_s is None else f", {kept_s[0]:.3f} to {kept_s[1]:.3f} s of the clip"
     part += " (whole groups are kept)" if kept_s is not None and is_widened else ""
-    return f"{part}, {result.clip.frame_count:,} frames at {result.clip.fps:g} fps, {result.clip.total_s:.2f} s"
+    frames = counted(result.clip.frame_count, "frame")
+    return f"{part}, {frames} at {result.clip.fps:g} fps, {result.clip.total_s:.2f} s"
 
 
 def _edits_from(options: argparse.Namespace) -> Edits:

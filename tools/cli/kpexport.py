@@ -41,7 +41,7 @@ from kpc.tools.exchange.options import DENSITY, PATH_FPS, RESOLUTION, SPACING_PA
 from kpc.tools.exchange.placement import Placement
 from kpc.tools.exchange.points import MAX_CELLS, Cloud, is_clipped, normals_of, surface_points
 from kpc.tools.rendering.content import Render, renderer_of
-from kpc.tools.rendering.shots import Shots, shots_of
+from kpc.tools.rendering.shots import Shots, rate_note, shots_of
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -70,6 +70,8 @@ def _export_geometry(task: Task, options: argparse.Namespace) -> None:
     shots = _shots(scene, loaded, options)
     if not task.is_folder and len(shots) != 1:
         raise UsageError(f"-o {options.output}: {len(shots)} frames do not go into one file; give a folder or --time")
+    if (note := rate_note(loaded.clip, options)) is not None:
+        _say(note)
     placement = Placement.of(scene.metadata)
     _say_where(placement, scene.metadata)
     if is_clipped(scene):

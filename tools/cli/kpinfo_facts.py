@@ -11,6 +11,7 @@ import numpy as np
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, KpcError, UsageError
+from kpc.format.common.text import counted
 from kpc.format.container.clip_sound import SoundSpan, sound_spans
 from kpc.format.container.container import Codec, Entry
 from kpc.format.container.groups import Groups
@@ -99,11 +100,6 @@ def totals(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "duration_s": sum(clip["duration_s"] for clip in clips),
         "groups": sum(len(info["groups"]) for info in files),
     }
-
-
-def counted(count: int, noun: str) -> str:
-    """Return a number with its noun, in the plural unless it is one."""
-    return f"{count:,} {noun}" + "s" * (count != 1)
 
 
 def _shown(file: str) -> str:

@@ -3,10 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from kpc.format.common.text import counted, first_names
 from kpc.format.scene.metadata import Metadata
-
-# Number of cameras that the page names; --json has all of them.
-CAMERAS_SHOWN = 8
 
 
 def metadata_rows(metadata: Metadata, sizes: Sequence[Sequence[int]]) -> list[tuple[str, str]]:
@@ -25,7 +23,7 @@ def metadata_rows(metadata: Metadata, sizes: Sequence[Sequence[int]]) -> list[tu
     names = [f"{name} {w}x{h}" for name, (w, h) in zip(metadata.camera_names, sizes, strict=False)]
     names = names or list(metadata.camera_names)
     if names:
-        rows.append(("names", ", ".join(names[:CAMERAS_SHOWN]) + ", ..." * (len(names) > CAMERAS_SHOWN)))
+        rows.append(("names", first_names(names, "--json")))
     rows += _provenance_rows(metadata.provenance)
     return rows
 
@@ -61,8 +59,9 @@ def _provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
         rows.append(("from", f"{provenance.get('layout', 'dataset')} {provenance['dataset_sha256']}"))
     held_out, quality = provenance.get("held_out", {}), []
     units = {"psnr_db": "PSNR {:.2f} dB", "ssim": "SSIM {:.4f}", "moving_psnr_db": "moving {:.2f} dB",
-             "still_psnr_db": "still {:.2f} dB", "pictures": "over {:g} pictures"}  # fmt: skip
+             "still_psnr_db": "still {:.2f} dB"}  # fmt: skip
     quality += [unit.format(held_out[name]) for name, unit in units.items() if name in held_out]
+    quality += [f"over {counted(held_out['pictures'], 'picture')}"] if "pictures" in held_out else []
     if quality:
         rows.append(("held out", ", ".join(quality)))
     if "coding_loss_db" in provenance:

@@ -4,18 +4,14 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from kpc.format.common.text import one_line
+from kpc.format.common.text import counted, first_names, one_line
 from kpc.format.container.http_address import printable
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import TIME_PLANES
 from kpc.player.cpu.motion_map import STILL
-from kpc.tools.cli.kpinfo_facts import counted
 from kpc.tools.cli.kpinfo_metadata import metadata_rows
 
 WIDTH = 80
-
-# Number of appearances that the page names; --json has all of them.
-NAMES_SHOWN = 8
 
 
 def page(info: Mapping[str, Any]) -> str:
@@ -204,9 +200,7 @@ def _appearances_line(names: Sequence[str]) -> list[str]:
     """Return the line on appearances, with the first few names; none without any."""
     if not names:
         return []
-    return _item(
-        "appearances", f"{len(names)}: {', '.join(names[:NAMES_SHOWN])}" + ", ..." * (len(names) > NAMES_SHOWN)
-    )
+    return _item("appearances", f"{len(names)}: {first_names(names, '--json')}")
 
 
 def _corner(point: Sequence[float]) -> str:

@@ -29,13 +29,14 @@ from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.common.films import FilmFormat, write_film
 from kpc.format.common.progress import progress
+from kpc.format.common.text import counted
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Part, Rendering
 from kpc.tools.rendering import pictures, resuming
 from kpc.tools.rendering.content import mean_picture, renderer_of
 from kpc.tools.rendering.options import MAX_SIDE, parser
 from kpc.tools.rendering.outputs import Output
-from kpc.tools.rendering.shots import Shots, shots_of
+from kpc.tools.rendering.shots import Shots, rate_note, shots_of
 from kpc.tools.rendering.sound import write_sound
 
 # Contents that change colours and not depth, and their options.
@@ -57,6 +58,8 @@ def _command(argv: list[str]) -> None:
     scene, _ = loaded.at(0.0)  # the first group of a long clip has the cameras and bounds of all
     shots = shots_of(scene, loaded.clip, options, output.is_film)
     _check(shots, output, options)
+    if (note := rate_note(loaded.clip, options)) is not None:
+        _say(note)
     if options.cameras and loaded.clip.frame_count > 1 and not any(shots.time(number) for number in shots.numbers):
         _say(f"{options.cameras}: all views are at the beginning of the clip; --time chooses another time")
     render, renderer = renderer_of(loaded, options)
@@ -76,8 +79,7 @@ def _command(argv: list[str]) -> None:
             what = _write_film(output, film, shots, picture, scene, options, sound if sound.exists() else None)
     else:
         what = _write_pictures(output, shots, picture, scene, options, is_transparent)
-    camera = shots.camera(shots.numbers[0])
-    print(f"{what}, {camera.width}x{camera.height}, in {clock.monotonic() - started:.1f} s")
+    print(f"{what}, in {clock.monotonic() - started:.1f} s")
 
 
 def _film_format(output: Output, options: argparse.Namespace) -> FilmFormat | None:
@@ -157,9 +159,10 @@ def _write_film(
         pixels = functools.partial(pictures.colour_pixels, is_transparent=film.has_alpha, bits=film.bits)
     frames = (pixels(picture(number)) for number in progress(shots.numbers, output.path.name, unit="frames"))
     write_film(output.path, frames, shots.fps, film, sound)
-    size = "" if padded == (camera.width, camera.height) else f" (padded to {padded[0]}x{padded[1]})"
+    size = f"{camera.width}x{camera.height}"
+    size += "" if padded == (camera.width, camera.height) else f" (padded to {padded[0]}x{padded[1]})"
     heard = "" if sound is None else ", with sound"
-    return f"{output.path}: {len(shots)} frame{'s' * (len(shots) != 1)} at {shots.fps:g} fps{heard}{size}"
+    return f"{output.path}: {counted(len(shots), 'frame')} at {shots.fps:g} fps, {size}{heard}"
 
 
 def _write_pictures(
@@ -190,7 +193,8 @@ def _write_pictures(
     for number, path in progress(wanted, "render", unit="pictures"):
         pictures.write_picture(path, picture(number), is_transparent, unit)
     there = f" ({len(shots) - len(wanted)} were there)" if len(wanted) < len(shots) else ""
-    return f"{output.path}: {len(shots)} picture{'s' * (len(shots) != 1)}{there}"
+    camera = shots.camera(shots.numbers[0])
+    return f"{output.path}: {counted(len(shots), 'picture')}{there}, {camera.width}x{camera.height}"
 
 
 def _say(text: str) -> None:

@@ -1,6 +1,7 @@
 """What pictures show: the scene by one of two renderers, its background, what moves, and the mean of many samples."""
 
 import argparse
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -161,6 +162,7 @@ def appearance_of(scene: Scene, text: str | None) -> np.ndarray | None:
     if text is None:
         return None
     names = {appearance.name for appearance in scene.appearances}
+    names |= {os.path.splitext(name)[0] for name in names}  # which `Scene.appearance` takes, too
     pair, _, share = text.rpartition(":")
     if text in names or ":" not in pair:
         return scene.appearance(text)

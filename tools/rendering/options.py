@@ -69,8 +69,8 @@ def _add_cameras(group: argparse._ArgumentGroup) -> None:
     cameras.add_argument(
         "--camera",
         metavar="N|NAME|JSON",
-        help="a fixed camera: one of the scene's by its number from 0 on or its name, or the one that such a file as "
-        "for --cameras lists (default: the view that the file opens with, or else 0)",
+        help="a fixed camera: one of the scene's by its name or else its number from 0 on, or the one that such a "
+        "file as for --cameras lists (default: the view that the file opens with, or else 0)",
     )
     cameras.add_argument(
         "--cameras",
@@ -117,7 +117,12 @@ def add_times(group: argparse._ArgumentGroup, is_rendering: bool = True) -> None
     )
     group.add_argument("--from", dest="start_s", type=cli.time_s, metavar="1.5s", help="begin at this time")
     group.add_argument("--to", dest="end_s", type=cli.time_s, metavar="4s", help="end before this time")
-    group.add_argument("--frames", type=_range, metavar="A-B", help="only the frames A to B, counted from 0 at --fps")
+    group.add_argument(
+        "--frames",
+        type=_range,
+        metavar="A-B",
+        help="only the frames A to B, counted from 0 at --fps; not with --from or --to",
+    )
     group.add_argument(
         "--step",
         type=functools.partial(integer, low=1, high=MAX_PICTURES),
@@ -139,14 +144,13 @@ def _add_content(group: argparse._ArgumentGroup) -> None:
         ("--static-only", "plate", "the clean plate: what is seen when what moves is gone"),
         ("--dynamic-only", "moving", "what moves and its shadow, cut out, over black or --background"),
         ("--matte", "matte", "how much of each pixel moves, white on black"),
-        ("--dynamic-map", "map", "what moves in colour, all else in grey"),
+        ("--dynamic-map", "map", "how much of each pixel moves, in red over the picture in grey"),
     ):
         part.add_argument(option, action="store_const", const=content, dest="content", help=text)
     part.add_argument(
         "--diagnose",
         dest="part",
-        type=Part,
-        choices=(Part.STATIC, Part.DYNAMIC),
+        type=_diagnosis,
         default=Part.FULL,
         metavar="static|dynamic",
         help="static: what the space planes alone show, time planes set to 1, which no one ever saw; dynamic: the "
@@ -222,6 +226,12 @@ def size(text: str) -> tuple[int, int]:
     if match is None or not all(1 <= int(n) <= MAX_SIDE for n in match.groups()):
         raise argparse.ArgumentTypeError(f"{text!r} is not a size like 640x480, at most {MAX_SIDE} per side")
     return int(match[1]), int(match[2])
+
+
+def _diagnosis(text: str) -> Part:
+    if text not in (Part.STATIC.value, Part.DYNAMIC.value):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither {Part.STATIC.value} nor {Part.DYNAMIC.value}")
+    return Part(text)
 
 
 def _colour(text: str) -> np.ndarray | str:

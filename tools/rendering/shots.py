@@ -14,6 +14,7 @@ import numpy as np
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import first_names
 from kpc.format.scene.cameras import Camera, View, load_views
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Clip, Scene
@@ -106,6 +107,8 @@ def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: boo
         )
     first, last, fps = 0, timeline.count - 1, timeline.fps
     if options.frames is not None:
+        if options.start_s is not None or options.end_s is not None:
+            raise UsageError("--frames chooses frames, --from and --to seconds; give only one of both")
         first, last = options.frames
         if last >= timeline.count:
             raise UsageError(f"--frames {first}-{last}: the last frame is {timeline.count - 1}")
@@ -122,8 +125,21 @@ def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: boo
     return Shots(timeline, range(first, last + 1, options.step), fps / options.step, options.shutter)
 
 
+def rate_of(clip: Clip) -> float:
+    """Return the frames per second without --fps: those of the clip within the limits of --fps; 1 or more of a static
+    scene, whose rate means nothing."""
+    return min(max(clip.fps, MIN_FPS if clip.frame_count > 1 else 1.0), MAX_FPS)
+
+
+def rate_note(clip: Clip, options: argparse.Namespace) -> str | None:
+    """Return a line for the user where the clip's own rate is beyond the limits of --fps; None where it is used."""
+    if options.fps is not None or clip.frame_count == 1 or rate_of(clip) == clip.fps:
+        return None
+    return f"the clip's {clip.fps:g} fps are beyond {MIN_FPS:g} to {MAX_FPS:g}; {rate_of(clip):g} fps are used"
+
+
 def _timeline(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bool) -> Timeline:
-    fps = float(options.fps or min(max(clip.fps, 1.0), MAX_FPS))
+    fps = float(options.fps or rate_of(clip))
     # What a frame adds to the clip's time, as a fraction: exact where the rate is the clip's.
     clip_frames, last_frame = clip.fps / fps, max(clip.frame_count - 1, 1)
     fixed_time: float | None = options.time
@@ -191,7 +207,7 @@ def _orbit(scene: Scene, options: argparse.Namespace) -> list[View]:
 
 
 def _camera(scene: Scene, options: argparse.Namespace) -> Camera:
-    """Return the fixed camera that --camera chooses: a number or a name of the scene's, or a file that lists one view.
+    """Return the fixed camera that --camera chooses: a name or a number of the scene's, or a file that lists one view.
 
     Without, it is the view that the scene opens with.
     """
@@ -199,15 +215,13 @@ def _camera(scene: Scene, options: argparse.Namespace) -> Camera:
         opening = scene.metadata.opening
         return Rig.of(scene).cameras[0] if opening is None else opening.camera
     cameras = Rig.of(scene).cameras
-    names = scene.metadata.names_of(len(cameras))
-    if options.camera.isdecimal():
-        if int(options.camera) >= len(cameras):
+    number = scene.metadata.camera_number(options.camera, len(cameras))
+    if number is not None:
+        if number >= len(cameras):
             raise UsageError(f"--camera {options.camera}: the scene has the cameras 0 to {len(cameras) - 1}")
-        return cameras[int(options.camera)]
-    if options.camera in names:
-        return cameras[names.index(options.camera)]
+        return cameras[number]
     if not Path(options.camera).exists():
-        known = f"{names[0]} to {names[-1]}" if len(names) > 1 else names[0]
+        known = first_names(scene.metadata.names_of(len(cameras)))
         raise UsageError(f"--camera {options.camera}: neither a file nor a camera of the scene, which has {known}")
     views = load_views(Path(options.camera))
     if len(views) != 1:
