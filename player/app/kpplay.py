@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kpc.format.common import cli
-from kpc.format.common.errors import ContextLostError, UsageError
+from kpc.format.common.errors import ContextLostError, KpcError, UsageError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.sources import RemoteSource, open_source
 from kpc.format.scene.rig import Rig
@@ -68,12 +68,15 @@ def _command(argv: list[str]) -> None:
     settings = _merged(preferences.load(file) if file else Preferences(), options)
     playlist = Playlist.named(options.scenes, settings.recent)
     stream = GroupPlayback(open_source(playlist.files[0], limit=options.memory), memory=options.memory)
-    last_settings = _play(stream, settings, options, path, playlist)
+    failures: list[str] = []
+    last_settings = _play(stream, settings, options, path, playlist, failures)
     if file is not None:
         try:
             preferences.save(last_settings, file)
         except OSError as error:
             print(f"kpplay: settings were not saved: {file}: {error.strerror or error}", file=sys.stderr)
+    if failures:
+        raise KpcError(f"loading stopped: {'; '.join(failures)}")
 
 
 def _play_in_browser(options: argparse.Namespace) -> None:
@@ -155,8 +158,12 @@ def _play(
     options: argparse.Namespace,
     path: CameraPath | None,
     playlist: Playlist,
+    failures: list[str],
 ) -> Preferences:
-    """Play the scene and others that are opened in the window; return the settings to save."""
+    """Play the scene and others that are opened in the window; return the settings to save.
+
+    Why the loading of a scene stopped is added to `failures`.
+    """
     # Imported here so that a scene that cannot be read is reported without a display.
     from kpc.player.app.player import Player
     from kpc.player.app.window import Window
@@ -177,7 +184,7 @@ def _play(
                 player.state.play_like(before)
             if stream.notice is not None and interrupted is None:
                 print(f"kpplay: {stream.notice}", file=sys.stderr)
-                player.state.notify(stream.notice)
+                player.state.notify_error(stream.notice)  # for long enough to outlast a slow first picture
             if path is not None:
                 player.state.follower.replace(path)
             path = interrupted = None
@@ -190,6 +197,8 @@ def _play(
                 if resets > MAX_RESETS:
                     raise
             finally:
+                if stream.failure is not None and stream.failure not in failures:
+                    failures.append(stream.failure)
                 settings = player.preferences()
                 if (report := player.close()) is not None:
                     print(f"kpplay: {report}", file=sys.stderr)

@@ -20,6 +20,8 @@ from kpc.player.cpu.serving import is_installed, serves, serves_grid
 
 # Texels a side of the planes, and cells a side of the grids, of what `sketch` returns.
 SIDE = 4
+# Seconds to wait for the end of the process before an error of the thread is reported.
+ENDING_S = 2.0
 
 
 class Loading:
@@ -34,7 +36,17 @@ class Loading:
 
     def begin(self, scene: Scene) -> None:
         """Load them in a thread."""
-        threading.Thread(target=self.run, args=(sketch(scene),), name="loading kernels", daemon=True).start()
+        threading.Thread(target=self._run_in_thread, args=(sketch(scene),), name="loading kernels", daemon=True).start()
+
+    def _run_in_thread(self, scene: Scene) -> None:
+        """Load them, and end without a word where that fails because the process ends: then pools take no more work."""
+        main = threading.main_thread()
+        try:
+            self.run(scene)
+        except BaseException:
+            main.join(ENDING_S)
+            if main.is_alive():
+                raise
 
     def run(self, scene: Scene) -> None:
         """Load them; those that are not in numba's cache are compiled by another process first."""

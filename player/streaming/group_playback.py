@@ -168,6 +168,11 @@ class GroupPlayback:
         return self._blended_number is None or (self._next is not None and self._next.stream.is_settled)
 
     @property
+    def failure(self) -> str | None:
+        """Why nothing more will arrive of the clip, or of the group that is shown; None if it will."""
+        return self.stream.failure if self._failure is None else str(self._failure)
+
+    @property
     def message(self) -> str | None:
         """A message for the user; None if everything works."""
         if self._failure is not None:

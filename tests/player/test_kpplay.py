@@ -142,7 +142,9 @@ def test_a_failing_server_is_reported_in_the_window(scene_file: Path, display: s
             done = kpplay(
                 f"{url}/tiny.kpc", "--size", "400x300", "--frames", 2, "--screenshot", screenshot, display=display
             )
-        assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+        errors = done.stderr.splitlines()
+        assert done.returncode == len(errors) == int(handler is Failing), done.stderr
+        assert all(line.startswith("kpplay: loading stopped: ") for line in errors)
     whole, failed = (
         read_image(screenshot).astype(int)[22:38, 250:390] for screenshot in pictures
     )  # where the message is, right of the HUD

@@ -144,6 +144,25 @@ def test_a_sketch_is_of_the_same_kind_and_small() -> None:
             assert all(np.all(plane == ("t" in name)) for scale in small.scales for name, plane in scale.items())
 
 
+ENDING = """
+import time
+from kpc.player.cpu import loading, threads
+
+def run(self, scene):
+    while True:
+        threads._POOL.submit(time.sleep, 0.01).result()
+
+loading.Loading.run, loading.sketch = run, lambda scene: scene
+loading.Loading().begin(None)
+time.sleep(0.1)
+"""
+
+
+def test_a_process_that_ends_while_kernels_are_loaded_says_nothing() -> None:
+    done = subprocess.run([sys.executable, "-c", ENDING], capture_output=True, text=True, check=True)
+    assert done.stdout == done.stderr == ""
+
+
 def test_another_process_warms_up() -> None:
     command = [sys.executable, "-m", "kpc.player.cpu.kernel_warm_up"]
     subprocess.run(command, input=pickle.dumps(loading.sketch(tiny_scene(4))), check=True)
