@@ -272,8 +272,9 @@ class Panels:
                 imgui.text_colored(ACCENT, f"finishing {name}")
                 return top
             if filming.is_along_path:
-                total = filming.path_frames  # of one width all along, so that the button stays where it is
-                text = f"frame {recording.taken:{len(str(total))}} of {total}{_time_left(filming.left_s):13}"
+                total = filming.path_frames
+                text = f"frame {recording.taken} of {total}{_time_left(filming.left_s)}"
+                text = f"{text:{23 + 2 * len(str(total))}}"  # of one width, so that the button stays where it is
             else:
                 text = f"{recording.duration_s:.1f} s"
             imgui.align_text_to_frame_padding()

@@ -100,7 +100,7 @@ class PathPanel:
             imgui.dummy((em(5), 0))
         imgui.same_line()
         clip = self.state.stream.clip
-        imgui.text_disabled(f"{keyframe.time * clip.duration_s:.2f} s")
+        imgui.text_disabled(f"clip {keyframe.time * clip.duration_s:.2f} s")
         tip(f"Time of the clip: frame {keyframe.time * (clip.frame_count - 1):.1f} of {clip.frame_count}, from 0")
         imgui.same_line()
         if imgui.button("x", (em(1.8), 0)):
