@@ -43,6 +43,8 @@ from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
 # Steps by which held-out cameras are aligned with the finished scene, at most and as a share of those of the run, and
 # rays of each step for each of them.
 ALIGN_STEPS, ALIGN_SHARE, ALIGN_RAYS = 100, 0.1, 512
+# Seconds between reports of progress, at least.
+REPORT_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ class Trainer:
         A checkpoint that cannot be written on the way is reported on stderr and does not stop training.
 
         Args:
-            report: called twice a second at most.
+            report: called once in REPORT_S seconds at most.
             checkpoint: file to write every `checkpoint_every_s` seconds and at the end.
             interrupted: called between steps.
 
@@ -170,7 +172,7 @@ class Trainer:
             self.elapsed_s += now - started - (MONITOR.spent_s - compiling_s)
             if self.step > 2 * config.occupancy_start:
                 self._steady_rays, self._steady_s = self._steady_rays + count, self._steady_s + now - started
-            if now - since > 0.5:
+            if now - since > REPORT_S:
                 psnr = psnr_from_mse(error / drawn)
                 report(
                     Report(

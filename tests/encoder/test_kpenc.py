@@ -26,6 +26,7 @@ from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.datasets import pixel_cache
 from kpc.encoder.evaluation.preview import Preview
 from kpc.encoder.field.config import PRESETS
+from kpc.encoder.training import train
 from kpc.encoder.training.train import Trainer
 from kpc.format.common import cli
 from kpc.format.container import scene_io
@@ -146,6 +147,7 @@ def test_the_hybrid_decoder(run: Kpenc, searched: None, sets: Path, tmp_path: Pa
 
 def test_the_result_is_printed(run: Kpenc, sets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     previewed: list[int] = []
+    monkeypatch.setattr(train, "REPORT_S", 0.0)
     monkeypatch.setattr(Preview, "write", lambda self, trainer, step: previewed.append(step))
     code, out, err = run(sets / "blender", "--preview")
     assert previewed[0] < previewed[-1] == 72

@@ -689,6 +689,8 @@ scenario('shows a coarse picture or the poster with preload="metadata"', async (
   const before = (await read()).length;
   await player(page, (it) => it.play());
   await until(page, (it) => it.readyState >= 3 && it.currentTime > 0);
+  // A request counts once its answer has arrived whole.
+  for (let tries = 0; (await read()).length <= before && tries < 200; tries++) await page.waitForTimeout(50);
   assert.ok((await read()).length > before);
   await close(page);
 });

@@ -55,7 +55,7 @@ export class KpcPlayer extends AudibleElement implements Model {
   #startView: string | null = null;
   #resumed: Resumed | null = null;
   #readyState = 0;
-  #progressAt = 0;
+  #progressAt = Number.NEGATIVE_INFINITY;
   readonly #scroll = new PageScroll();
 
   constructor() {
