@@ -41,14 +41,19 @@ def test_training_is_extrapolated_from_the_watched_steps(moving: Dataset, monkey
     assert found.rest_s > 2 and found.memory_bytes > 16 * run.field.theta.numel()
 
 
-def test_fine_tuning_is_counted(moving: Dataset) -> None:
-    """From the time of a ray in training and in rendering."""
+def test_fine_tuning_is_counted(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the time of coding once, and of a ray in training and in rendering."""
+    for name, seconds in (("_time_coding", 2.0), ("_time_ray", 1e-4), ("_time_curvature", 1.0)):
+        monkeypatch.setattr(module, name, lambda _, seconds=seconds: seconds)
     found = []
     for tune_steps in (0, 100):
         run = Trainer(moving, replace(CONFIG, steps=1250, tune_steps=tune_steps), BOX, "cpu")
         found.append(module.estimate(run, validation_rays=100, test_views=0, spent_s=0.0, time_budget_s=None).rest_s)
-    trained = module.TUNED_CODINGS * 2.5 * 100 * module.RAYS / run.rays_per_second
-    assert found[1] - found[0] == pytest.approx(trained, rel=0.5)
+    scene = run.scene()
+    steps = module.total_steps(scene, module.steps_per_group(1250, scene, 100))
+    tuned = 2.0 + steps * module.RAYS * (1 / run.rays_per_second + 1e-4)
+    assert 200 < steps <= 250
+    assert found[1] - found[0] == pytest.approx(module.TUNED_CODINGS * tuned)
 
 
 def test_steps_of_the_coarsest_scale_are_counted_separately(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
