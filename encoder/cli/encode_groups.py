@@ -28,6 +28,7 @@ from kpc.encoder.training.importance import has_static_cameras
 from kpc.encoder.training.refinement import with_corrections
 from kpc.format.common import cli
 from kpc.format.common.errors import TrainingError, UsageError
+from kpc.format.common.text import option_name
 from kpc.format.container import groups, scene_io
 from kpc.format.container.metadata_options import TEXTS
 from kpc.format.scene.metadata import Metadata
@@ -163,10 +164,7 @@ def _fingerprint(options: Options) -> dict[str, str]:
     without = ("resume", "keep", "preview", "trade", "cache", "members")
     given = {name: value for name, value in vars(options).items() if name not in without}
     given |= {name: options.members.get(name) for name in TEXTS}
-    names = {
-        f"--{name.removesuffix('_s').replace('_', '-')}": "the default" if value is None else str(value)
-        for name, value in given.items()
-    }
+    names = {option_name(name): "the default" if value is None else str(value) for name, value in given.items()}
     return names | {"the target": "{} {:g}".format(*options.trade.bound)}
 
 

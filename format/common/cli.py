@@ -184,7 +184,7 @@ def input_path(text: str) -> Path:
 
 
 def file_name(text: str) -> str:
-    """Take a path or an address as it is; refuse an empty one, which as a path is the working directory, and "-"."""
+    """Return a path or an address unchanged; refuse an empty one, which as a path is the working directory, and "-"."""
     if not text:
         raise argparse.ArgumentTypeError("the name is empty")
     if text == "-":
@@ -233,9 +233,8 @@ def frame_rate(low: float, high: float) -> Callable[[str], float]:
 
     def parse(text: str) -> float:
         above, slash, below = text.partition("/")
-        if slash and above.isdecimal() and below.isdecimal() and int(below) > 0:
-            number_within(str(int(above) / int(below)), low, high, "a frame rate")
-            return int(above) / int(below)
+        if slash and above.isdecimal() and below.isdecimal() and float(below) > 0:
+            text = repr(float(above) / float(below))
         return number_within(text, low, high, "a frame rate")
 
     return parse

@@ -51,6 +51,11 @@ def first_names(names: Sequence[str], command: str = "kpinfo --json") -> str:
     return f"{shown} ({more:,} more; {command} lists all)" if more > 0 else shown
 
 
+def option_name(field: str) -> str:
+    """Return the option of a command that sets a field of its options, whose name ends with its unit."""
+    return "--" + field.removesuffix("_s").removesuffix("_db").replace("_", "-")
+
+
 def one_line(text: str) -> str:
     """Return text for a message, with what cannot be printed (line breaks, control codes, surrogates) as escapes."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from kpc.format.common.text import option_name
 from kpc.format.scene.cameras import Camera
 
 HISTORY_LIMIT = 64  # entries of the history; the last ones are kept
@@ -192,7 +193,7 @@ def _differing(documents: list[Mapping[str, Any]], kept: Mapping[str, Any], are_
             inner = [document.get(name, {}) for document in documents]
             found += _differing(inner, kept.get(name, {}), name == "options")
         elif name not in kept and are_options:
-            found.append("--" + name.removesuffix("_s").removesuffix("_db").replace("_", "-"))
+            found.append(option_name(name))
         elif name not in kept:
             found.append(WORDS.get(name, name).replace("_", " "))
     return found

@@ -14,14 +14,10 @@ from kpc.encoder.cli.encode_groups import setting_of_span
 from kpc.encoder.cli.encode_scene import encode_scene
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import Setting, prepare_setting
-from kpc.encoder.datasets import Dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer, compare
-from kpc.encoder.rdo.codec_model import widen_single_texels
 from kpc.format.common.errors import DatasetError
-from kpc.format.container import scene_io
-from kpc.format.container.groups import Span
+from kpc.format.container.groups import Groups, Span
 from kpc.tools.bench import quality
-from kpc.tools.bench.group_joins import Shown
+from kpc.tools.bench.group_joins import Shown, shown_frames
 
 
 @dataclass(frozen=True)
@@ -71,13 +67,5 @@ def _encoded_alone(frame: int, setting: Setting, options: Options) -> Iterator[S
     alone = setting_of_span(replace(setting, sound=None), Span(frame, 1))
     output = options.output.with_name(f"{options.output.stem}-{frame:04d}.kpc")
     encode_scene(replace(options, output=output, work=output.with_suffix(".work"), keep=False), alone)
-    renderer = SceneRenderer(widen_single_texels(scene_io.read(output)).dequantise())
-    yield from _compared(renderer, alone.dataset, frame)
-
-
-def _compared(renderer: SceneRenderer, dataset: Dataset, frame: int) -> Iterator[Shown]:
-    pictures = dataset.pictures
-    for number in np.flatnonzero(pictures.is_test).tolist():
-        camera, key = int(pictures.camera[number]), int(pictures.offset[number])
-        found = compare(renderer, dataset, number)
-        yield Shown(camera, dataset.camera_names[camera], frame, 0, key, found, None)
+    for shown in shown_frames(Groups(output), alone.dataset):
+        yield replace(shown, frame=frame)
