@@ -1,4 +1,4 @@
-"""Tiny videos for tests, made by ffmpeg, whose frames can be told apart."""
+"""Tiny videos for tests, made by ffmpeg, whose frames can be distinguished."""
 
 import subprocess
 from pathlib import Path

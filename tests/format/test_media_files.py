@@ -1,4 +1,4 @@
-"""Images and videos are told by their suffixes in any case; what systems leave in folders is neither."""
+"""Images and videos are recognised by their suffixes in any case; what systems leave in folders is neither."""
 
 import pytest
 
