@@ -1,9 +1,7 @@
-"""Vector operations that numba has no types for, written in LLVM's terms for `kpc.player.cpu.raymarch`: sums over grid
-nodes and over channels.
+"""Vector operations for `kpc.player.cpu.raymarch`: sums over grid nodes and over channels.
 
 Left to itself, numba makes vectors of loops only. Four channels are too few for a loop, which it would process number
-by number at four times the cost, and it sums up the vectors of a dot product one by one. LLVM fits the vectors asked
-for here to those that the processor has.
+by number at four times the cost, and it sums up the vectors of a dot product one by one.
 """
 
 from collections.abc import Sequence
@@ -16,12 +14,24 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from kpc.player.cpu.serving import CHANNELS, NARROW, WIDE
+from kpc.vectors import (
+    FLOAT,
+    INDEX,
+    LANE,
+    SHORT,
+    added,
+    array_of,
+    constant,
+    load,
+    product,
+    spread,
+    store,
+    sums,
+    vector_type,
+)
 
 # Sums are clamped to this.
 LARGEST = 1e30
-
-_INDEX, _LANE, _SHORT, _FLOAT = ir.IntType(64), ir.IntType(32), ir.IntType(16), ir.FloatType()
-_CONTRACT = ["contract"]
 
 
 @intrinsic
@@ -56,10 +66,10 @@ def interpolate(
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
         _, first, right, up, back, x, y, z, _, line, column = arguments
         nodes, out = (
-            _array(context, builder, signature, arguments, 0),
-            _array(context, builder, signature, arguments, 8),
+            array_of(context, builder, signature, arguments, 0),
+            array_of(context, builder, signature, arguments, 8),
         )
-        one = ir.Constant(_FLOAT, 1.0)
+        one = ir.Constant(FLOAT, 1.0)
         ways = [(step, builder.fsub(one, share), share) for step, share in ((right, x), (up, y), (back, z))]
         terms = []
         for number in range(1 << len(ways)):
@@ -67,13 +77,13 @@ def interpolate(
             for bit, (step, near, far) in enumerate(ways):
                 node = builder.add(node, step) if number >> bit & 1 else node
                 weight = builder.fmul(weight, far if number >> bit & 1 else near)
-            values = _load(builder, nodes.data, builder.mul(node, _INDEX(CHANNELS)), CHANNELS)
-            terms.append(builder.fmul(values, _spread(builder, weight, CHANNELS), flags=_CONTRACT))
-        total = _sum(builder, terms)
+            values = load(builder, nodes.data, builder.mul(node, INDEX(CHANNELS)), CHANNELS)
+            terms.append(product(builder, values, spread(builder, weight, CHANNELS)))
+        total = added(builder, *terms)
         columns = builder.extract_value(out.shape, 1)
         for channel in range(CHANNELS):
-            at = builder.add(builder.mul(builder.add(line, _INDEX(channel)), columns), column)
-            builder.store(builder.extract_element(total, _LANE(channel)), builder.gep(out.data, [at]))
+            at = builder.add(builder.mul(builder.add(line, INDEX(channel)), columns), column)
+            builder.store(builder.extract_element(total, LANE(channel)), builder.gep(out.data, [at]))
         return context.get_dummy_value()
 
     return types.void(grid, first, right, up, back, x, y, z, into, line, column), generate
@@ -99,33 +109,32 @@ def decode_corner(_: Any, wholes: Any, factors: Any, weights: Any, bias: Any, in
             for kind, arrays in zip(signature.args[:2], arguments[:2], strict=True)
         )
         _, _, _, bias, _, row = arguments
-        weights, out = (_array(context, builder, signature, arguments, n) for n in (2, 4))
+        weights, out = (array_of(context, builder, signature, arguments, n) for n in (2, 4))
         count = builder.extract_value(factors[0].shape, 0)
-        nothing = _constant(0.0, WIDE)
-        sums = [cgutils.alloca_once_value(builder, nothing) for _ in range(CHANNELS)]
-        for sum_ in sums:  # once a call, where the line above is once a function
+        nothing = constant(0.0, WIDE)
+        totals = [cgutils.alloca_once_value(builder, nothing) for _ in range(CHANNELS)]
+        for sum_ in totals:  # once a call, where the line above is once a function
             builder.store(nothing, sum_)
-        with cgutils.for_range_slice(builder, _INDEX(0), count, _INDEX(WIDE), inc=True) as (m, _):
-            of_wholes = [builder.sitofp(_load(builder, array.data, m, WIDE, _SHORT), _vector(WIDE)) for array in wholes]
-            feature = reduce(builder.fmul, [*of_wholes, *(_load(builder, array.data, m, WIDE) for array in factors)])
-            for channel, sum_ in enumerate(sums):
-                weight = _load(builder, weights.data, builder.add(builder.mul(count, _INDEX(channel)), m), WIDE)
-                builder.store(
-                    builder.fadd(builder.load(sum_), builder.fmul(feature, weight, flags=_CONTRACT), flags=_CONTRACT),
-                    sum_,
-                )
-        total = _sums(builder, [builder.load(sum_) for sum_ in sums], WIDE)
-        total = builder.fadd(total, builder.insert_element(_constant(0.0, CHANNELS), bias, _LANE(CHANNELS - 1)))
+        with cgutils.for_range_slice(builder, INDEX(0), count, INDEX(WIDE), inc=True) as (m, _):
+            of_wholes = [
+                builder.sitofp(load(builder, array.data, m, WIDE, SHORT), vector_type(WIDE)) for array in wholes
+            ]
+            feature = reduce(builder.fmul, [*of_wholes, *(load(builder, array.data, m, WIDE) for array in factors)])
+            for channel, sum_ in enumerate(totals):
+                weight = load(builder, weights.data, builder.add(builder.mul(count, INDEX(channel)), m), WIDE)
+                builder.store(added(builder, builder.load(sum_), product(builder, feature, weight)), sum_)
+        total = sums(builder, [builder.load(sum_) for sum_ in totals], WIDE)
+        total = builder.fadd(total, builder.insert_element(constant(0.0, CHANNELS), bias, LANE(CHANNELS - 1)))
         is_number = builder.fcmp_ordered("ord", total, total)
         for limit, keeps in ((LARGEST, "<"), (-LARGEST, ">")):
             total = builder.select(
-                builder.fcmp_ordered(keeps, total, _constant(limit, CHANNELS)), total, _constant(limit, CHANNELS)
+                builder.fcmp_ordered(keeps, total, constant(limit, CHANNELS)), total, constant(limit, CHANNELS)
             )
-        _store(
+        store(
             builder,
-            builder.select(is_number, total, _constant(0.0, CHANNELS)),
+            builder.select(is_number, total, constant(0.0, CHANNELS)),
             out.data,
-            builder.mul(row, _INDEX(CHANNELS)),
+            builder.mul(row, INDEX(CHANNELS)),
         )
         return context.get_dummy_value()
 
@@ -170,101 +179,40 @@ def accumulate_features(
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        planes, rows, weights, out = (_array(context, builder, signature, arguments, n) for n in (0, 3, 6, 9))
+        planes, rows, weights, out = (array_of(context, builder, signature, arguments, n) for n in (0, 3, 6, 9))
         texels, ups, starts, shares = (cgutils.unpack_tuple(builder, arguments[n]) for n in (1, 2, 4, 5))
         first, line, column = (arguments[n] for n in (7, 10, 11))
         wide = NARROW * len(signature.args[8])
-        one = ir.Constant(_FLOAT, 1.0)
+        one = ir.Constant(FLOAT, 1.0)
         corners = []
         for texel, up, axes in zip(texels, ups, ((0, 1), (0, 2), (1, 2)), strict=True):
-            above, next_ = builder.add(texel, up), _INDEX(wide)
+            above, next_ = builder.add(texel, up), INDEX(wide)
             places = texel, builder.add(texel, next_), above, builder.add(above, next_)
             across, along = ((builder.fsub(one, shares[axis]), shares[axis]) for axis in axes)
-            factors = [_spread(builder, builder.fmul(x, y), NARROW) for y in along for x in across]
+            factors = [spread(builder, builder.fmul(x, y), NARROW) for y in along for x in across]
             corners.append(list(zip(places, factors, strict=True)))
-        ways, sums = [_spread(builder, share, NARROW) for share in shares], [_constant(0.0, NARROW)] * CHANNELS
+        ways, totals = [spread(builder, share, NARROW) for share in shares], [constant(0.0, NARROW)] * CHANNELS
         for half in range(0, wide, NARROW):
-            m, factors = _INDEX(half), []
+            m, factors = INDEX(half), []
             for plane in corners:
-                wholes = [_load(builder, planes.data, builder.add(place, m), NARROW, _SHORT) for place, _ in plane]
-                floats = [builder.sitofp(whole, _vector(NARROW)) for whole in wholes]
-                factors.append(
-                    _sum(
-                        builder,
-                        [
-                            builder.fmul(x, factor, flags=_CONTRACT)
-                            for x, (_, factor) in zip(floats, plane, strict=True)
-                        ],
-                    )
-                )
+                wholes = [load(builder, planes.data, builder.add(place, m), NARROW, SHORT) for place, _ in plane]
+                floats = [builder.sitofp(whole, vector_type(NARROW)) for whole in wholes]
+                terms = (product(builder, x, factor) for x, (_, factor) in zip(floats, plane, strict=True))
+                factors.append(added(builder, *terms))
             for start, way in zip(starts, ways, strict=True):
                 before, behind = (
-                    _load(builder, rows.data, builder.add(start, _INDEX(half + further)), NARROW)
-                    for further in (0, wide)
+                    load(builder, rows.data, builder.add(start, INDEX(half + further)), NARROW) for further in (0, wide)
                 )
-                factors.append(
-                    _sum(builder, [before, builder.fmul(way, builder.fsub(behind, before), flags=_CONTRACT)])
-                )
+                factors.append(added(builder, before, product(builder, way, builder.fsub(behind, before))))
             feature = reduce(builder.fmul, factors)
             for c in range(CHANNELS):
-                weight = _load(builder, weights.data, builder.add(first, _INDEX(wide * c + half)), NARROW)
-                sums[c] = _sum(builder, [sums[c], builder.fmul(feature, weight, flags=_CONTRACT)])
-        total = _sums(builder, sums, NARROW)
+                weight = load(builder, weights.data, builder.add(first, INDEX(wide * c + half)), NARROW)
+                totals[c] = added(builder, totals[c], product(builder, feature, weight))
+        total = sums(builder, totals, NARROW)
         columns = builder.extract_value(out.shape, 1)
         for c in range(CHANNELS):
-            place = builder.gep(out.data, [builder.add(builder.mul(builder.add(line, _INDEX(c)), columns), column)])
-            builder.store(builder.fadd(builder.load(place), builder.extract_element(total, _LANE(c))), place)
+            place = builder.gep(out.data, [builder.add(builder.mul(builder.add(line, INDEX(c)), columns), column)])
+            builder.store(builder.fadd(builder.load(place), builder.extract_element(total, LANE(c))), place)
         return context.get_dummy_value()
 
     return types.void(planes, texels, ups, rows, starts, shares, weights, first, halves, into, line, column), generate
-
-
-def _sum(builder: Any, terms: Sequence[Any]) -> Any:
-    return reduce(lambda sum, term: builder.fadd(sum, term, flags=_CONTRACT), terms)
-
-
-def _sums(builder: Any, vectors: Sequence[Any], wide: int) -> Any:
-    """Return the sums of the numbers of each of four vectors, as one vector of four."""
-    while wide > CHANNELS:
-        wide //= 2
-        halves = range(wide), range(wide, 2 * wide)
-        vectors = [builder.fadd(*(_picked(builder, vector, vector, lanes) for lanes in halves)) for vector in vectors]
-    a, b, c, d = vectors
-    one, other = (
-        builder.fadd(_picked(builder, x, y, (0, 4, 1, 5)), _picked(builder, x, y, (2, 6, 3, 7)))
-        for x, y in ((a, b), (c, d))
-    )
-    return builder.fadd(_picked(builder, one, other, (0, 1, 4, 5)), _picked(builder, one, other, (2, 3, 6, 7)))
-
-
-def _array(context: Any, builder: Any, signature: Any, arguments: Sequence[Any], number: int) -> Any:
-    return context.make_array(signature.args[number])(context, builder, arguments[number])
-
-
-def _vector(count: int, kind: Any = _FLOAT) -> ir.VectorType:
-    return ir.VectorType(kind, count)
-
-
-def _constant(value: float, count: int) -> ir.Constant:
-    return ir.Constant(_vector(count), [value] * count)
-
-
-def _load(builder: Any, data: Any, at: Any, count: int, kind: Any = _FLOAT) -> Any:
-    vector = builder.load(builder.bitcast(builder.gep(data, [at]), _vector(count, kind).as_pointer()))
-    vector.align = 2 if kind is _SHORT else 4
-    return vector
-
-
-def _store(builder: Any, vector: Any, data: Any, at: Any) -> None:
-    builder.store(vector, builder.bitcast(builder.gep(data, [at]), vector.type.as_pointer())).align = 4
-
-
-def _spread(builder: Any, value: Any, count: int) -> Any:
-    """A vector of so many of one number."""
-    vector = builder.insert_element(ir.Constant(_vector(count), ir.Undefined), value, _LANE(0))
-    return _picked(builder, vector, vector, [0] * count)
-
-
-def _picked(builder: Any, one: Any, other: Any, lanes: Sequence[int] | range) -> Any:
-    """The numbers of a vector and another, counted through, that these are."""
-    return builder.shuffle_vector(one, other, ir.Constant(_vector(len(lanes), _LANE), list(lanes)))
