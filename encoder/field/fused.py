@@ -28,7 +28,14 @@ def plane_set(
     """Return planes (n,) and motion grid as the kernels take them, with the coarsest `scales` only where given."""
     if motion is None:
         motion = np.zeros((0, 1, 1, 1, 3), np.float32)
-    return kernels.PlaneSet(theta, layout.table[:scales], layout.resolution[:scales], layout.channels, motion)
+    table, resolution = layout.table[:scales], layout.resolution[:scales]
+    places = np.zeros((len(table), 2, kernels.PLACES), np.int32)
+    places[:, 0, : len(kernels.AXES)] = table // layout.channels
+    places[:, 1, : len(kernels.AXES)] = resolution[:, [column_axis for column_axis, _ in kernels.AXES]]
+    intervals = (resolution - 1).astype(np.float32)
+    return kernels.PlaneSet(
+        theta, places.reshape(len(table), -1), intervals, layout.channels, layout.is_dynamic, motion
+    )
 
 
 def planes_of(field: Field, scales: int | None = None) -> kernels.PlaneSet:

@@ -45,7 +45,8 @@ class FusedOptimiser:
         # The decoder is so small that more threads only slow it down, a hundredfold on a busy machine.
         torch.set_num_threads(1)
         self.theta = field.theta.detach().numpy()
-        self.grad = np.zeros((self.workers, self.theta.size), np.float32)
+        # PyTorch aligns arrays with lines of the processor's cache, of which unaligned texels would take one more each.
+        self.grad = torch.zeros((self.workers, self.theta.size)).numpy()
         self.mean, self.square = np.zeros_like(self.theta), np.zeros_like(self.theta)
         self._peaks = np.zeros((self.workers, *cells), np.float32)
         self.decoder = decoder_optimiser(field, config)

@@ -15,8 +15,10 @@ Symbols in shape comments
 Modules
     compilation  how kernels are compiled
     arguments    named tuples that kernels take
-    geometry     rays, occupancy cells, displacement by the motion grid
-    planes       bilinear sampling of planes, products over planes, and the transposes of both
+    geometry     rays, occupancy cells, slopes of the motion grid
+    vectors      weighted sums, products and exponentials of many numbers at a time
+    texels       the texels of one scale's planes, and the nodes of the motion grid, around a point
+    planes       sampling of all planes at a sample of a ray, and its transpose
     marching     one ray through the field; rendering; lists of samples
     backward     the gradient of a batch's loss
     points       features and densities at given points
@@ -30,9 +32,12 @@ from kpc.encoder.field.kernels.arguments import RAY_GRADIENTS, Gradients, PlaneS
 from kpc.encoder.field.kernels.backward import backpropagate
 from kpc.encoder.field.kernels.marching import collect_samples, render
 from kpc.encoder.field.kernels.points import features, log_densities, scatter_features
+from kpc.encoder.field.kernels.texels import AXES, PLACES
 from kpc.encoder.field.kernels.updates import adam, add_sparse_transients, add_time_smoothness, add_variation
 
 __all__ = [
+    "AXES",
+    "PLACES",
     "RAY_GRADIENTS",
     "Gradients",
     "PlaneSet",

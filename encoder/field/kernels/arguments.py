@@ -16,9 +16,10 @@ class PlaneSet(NamedTuple):
     """The planes of a field, and its motion grid."""
 
     theta: np.ndarray  # (n,) float32, all planes one after the other, each (rows, columns, M)
-    table: np.ndarray  # (S, 6) int64, first element in theta of xy xz yz xt yt zt; -1 where there is no such plane
-    resolution: np.ndarray  # (S, 4) int64, texels along x, y, z and t
+    places: np.ndarray  # (S, 16) int32: of xy xz yz xt yt zt first texel in theta [0:6], texels in a row [8:14]
+    intervals: np.ndarray  # (S, 4) float32, between texels along x, y, z and t
     channels: int  # M
+    is_dynamic: bool  # whether there are planes in space and time
     motion: np.ndarray  # (T, Nz, Ny, Nx, 3) float32, displacements (`kpc.format.scene.motion`); T is 0: there are none
 
 
@@ -66,19 +67,16 @@ class SampleArrays(NamedTuple):
 class RayBuffers(NamedTuple):
     """One worker's memory for the samples of the current ray; K is the most that a ray can have."""
 
-    values: np.ndarray  # (K, S * 6 * M) float32, what each plane holds at a sample; 1 for planes that do not exist
+    values: np.ndarray  # (K, S * 6 * M) float32, what each plane holds at a sample
     features: np.ndarray  # (K, F) float32
-    points: np.ndarray  # (K, 7) float32: u displaced, time, u before displacement
-    corners: np.ndarray  # (K, S * 6) int64, first element in theta of the texel below each sample
-    fractions: np.ndarray  # (K, S * 4) float32, position between texels along x, y, z, t
+    points: np.ndarray  # (K, 8) float32: u displaced, time, u before displacement, time
     s: np.ndarray  # (K,) float32
     log_densities: np.ndarray  # (K,) float32, clipped
     taus: np.ndarray  # (K,) float32, optical thickness
     weights: np.ndarray  # (K,) float32, transmittance times alpha
-    colours: np.ndarray  # (K, 3) float32
+    decoded: np.ndarray  # (K, 4) float32, log density without bias, and logits, which become colours
     g_weights: np.ndarray  # (K,) float32, gradient of the distortion loss with respect to the weights
-    g_features: np.ndarray  # (F,) float32, of the current sample
-    g_values: np.ndarray  # (6 * M,) float32, of the current sample and scale
-    slopes: np.ndarray  # (4 * M,) float32, gradient with respect to u and time, by axis and channel
+    g_features: np.ndarray  # (1, F) float32, of the current sample
+    decoder: np.ndarray  # (4 * F,) float32, weights of the log density and of three colours, of the current ray
+    g_decoder: np.ndarray  # (4 * F,) float32, their gradient
     g_point: np.ndarray  # (4,) float32, gradient with respect to u and time
-    ones: np.ndarray  # (M,) float32

@@ -6,8 +6,21 @@ from numba import prange
 from kpc.encoder.field.kernels.arguments import Gradients
 from kpc.encoder.field.kernels.compilation import bare, inlined, parallel
 from kpc.encoder.field.kernels.geometry import add_ray_gradient, cell_index, inverse_edges, ray_distance
-from kpc.encoder.field.kernels.marching import LIMIT, march_ray, negligible_weight, new_ray_buffers, shade_ray
-from kpc.encoder.field.kernels.planes import point_gradient, scatter_motion, scatter_planes, undisplace_gradient
+from kpc.encoder.field.kernels.marching import (
+    LIMIT,
+    march_ray,
+    negligible_weight,
+    new_ray_buffers,
+    set_decoder,
+    shade_ray,
+)
+from kpc.encoder.field.kernels.planes import scatter_planes, undisplace_gradient
+from kpc.encoder.field.kernels.texels import displace_transpose
+from kpc.encoder.field.kernels.vectors import blend, blend_transpose
+from kpc.encoder.field.occupancy_grid import OccupancyGrid
+
+# Smaller weights of samples make no cell matter.
+LEAST_PEAK = np.float32(OccupancyGrid.MIN_PEAK)
 
 
 @bare
@@ -28,76 +41,73 @@ def distortion_gradient(buffers, count, volume, factor):
 
 
 @inlined
-def decoder_gradient(density, basis, g_log, weight, g_rgb, feature, colour, g_features, g_density, g_basis):
-    """Set g_features (F,), and add the gradients of density and basis, of one sample.
+def end_decoder(buffers, g_density, g_basis):
+    """Add the gradient of the decoder's weights over a ray."""
+    F = g_density.size - 1
+    for i in range(F):
+        g_density[i] += buffers.g_decoder[i]
+    for c in range(3):
+        for i in range(F):
+            g_basis[c, i] += buffers.g_decoder[(c + 1) * F + i]
+
+
+@inlined
+def decoder_gradient(buffers, k, g_log, g_rgb):
+    """Set buffers.g_features, and add to buffers.g_decoder, by sample k.
 
     log density = density . (features, 1);  colour_c = sigmoid(basis_c . features), 0 where the sample got none
     """
-    F = g_features.size
-    for i in range(F):
-        g_features[i] = g_log * density[i]
-        g_density[i] += g_log * feature[i]
-    g_density[F] += g_log
-    if colour[0] + colour[1] + colour[2] > 0:
-        for c in range(3):
-            g_c = g_rgb[0] if c == 0 else (g_rgb[1] if c == 1 else g_rgb[2])
-            g_c *= weight * colour[c] * (np.float32(1.0) - colour[c])
-            for i in range(F):
-                g_features[i] += g_c * basis[c, i]
-                g_basis[c, i] += g_c * feature[i]
+    F, one = buffers.features.shape[1], np.float32(1.0)
+    weight, red, green, blue = buffers.weights[k], buffers.decoded[k, 1], buffers.decoded[k, 2], buffers.decoded[k, 3]
+    factors = (
+        g_log,
+        g_rgb[0] * weight * red * (one - red),
+        g_rgb[1] * weight * green * (one - green),
+        g_rgb[2] * weight * blue * (one - blue),
+    )
+    blend(buffers.decoder, 0, 2 * F, factors, F, buffers.g_features, 0)
+    blend_transpose(buffers.g_decoder, 0, 2 * F, factors, F, buffers.features, k * F)
 
 
 @bare
-def backpropagate_ray(
-    planes, density, volume, origin, direction, basis, buffers, count, trans, g_rgb, g_background, gradients, peaks
-):
+def backpropagate_ray(planes, volume, origin, direction, buffers, count, trans, g_rgb, g_background, gradients, peaks):
     """Add the gradients of one ray after `march_ray` and `shade_ray`, from its last sample to its first.
 
     Its parameters are those of a ray one by one, since kernels take no nested tuples.
 
     Args:
-        planes, density, volume, origin, direction, buffers: as of `march_ray`. basis: (3, F).
+        planes, volume, origin, direction, buffers: as of `march_ray`.
         count, trans: what `march_ray` returned.
         g_rgb: d loss / d C, three numbers.
         g_background: trans * g_rgb . background.
         gradients: `Gradients` of this worker and ray: (n,), (F + 1,), (3, F), (T, Nz, Ny, Nx, 3), (RAY_GRADIENTS,).
-        peaks: (Nz, Ny, Nx), raised to the weights of the samples in each cell.
+        peaks: (Nz, Ny, Nx), raised to the weights above LEAST_PEAK of the samples in each cell.
     """
     inverse, negligible = inverse_edges(volume.aabb), negligible_weight(count)
     if gradients.wants_rays:
         gradients.rays[7], gradients.rays[8], gradients.rays[9] = g_rgb
+    buffers.g_decoder[:] = np.float32(0.0)
     behind = g_background  # d loss / d C times the colour that comes from behind sample k
     trans_after = trans  # transmittance after sample k
     for k in range(count - 1, -1, -1):
-        weight, colour = buffers.weights[k], buffers.colours[k]
-        g_weight = g_rgb[0] * colour[0] + g_rgb[1] * colour[1] + g_rgb[2] * colour[2] + buffers.g_weights[k]
+        weight, colour = buffers.weights[k], buffers.decoded[k]
+        g_weight = g_rgb[0] * colour[1] + g_rgb[1] * colour[2] + g_rgb[2] * colour[3] + buffers.g_weights[k]
         g_log_tau = (trans_after * g_weight - behind) * buffers.taus[k]
         g_log = g_log_tau
         if buffers.log_densities[k] >= LIMIT or buffers.log_densities[k] <= -LIMIT:
             g_log = np.float32(0.0)
-        cell = cell_index(peaks, buffers.points[k, 4], buffers.points[k, 5], buffers.points[k, 6])
-        peaks[cell] = max(peaks[cell], weight)
+        if weight > LEAST_PEAK:
+            cell = cell_index(peaks, buffers.points[k, 4], buffers.points[k, 5], buffers.points[k, 6])
+            peaks[cell] = max(peaks[cell], weight)
         behind += weight * g_weight
         trans_after += weight
-        decoder_gradient(
-            density,
-            basis,
-            g_log,
-            weight,
-            g_rgb,
-            buffers.features[k],
-            colour,
-            buffers.g_features,
-            gradients.density,
-            gradients.basis,
-        )
+        gradients.density[-1] += g_log
+        decoder_gradient(buffers, k, g_log, g_rgb)
         wants_ray = gradients.wants_rays and weight > negligible  # as for colours: others hardly move a picture
         wants_point = wants_ray or gradients.wants_motion
-        scatter_planes(planes, gradients.theta, buffers.g_features, buffers, k, wants_point, wants_ray)
-        if wants_point:
-            point_gradient(buffers, k)
+        scatter_planes(planes, gradients.theta, buffers.g_features, 0, buffers, k, wants_point)
         if gradients.wants_motion:
-            scatter_motion(gradients.motion, buffers, k)
+            displace_transpose(gradients.motion, buffers.points, k, buffers.g_point)
         if wants_ray:
             undisplace_gradient(planes.motion, buffers, k)
             add_ray_gradient(
@@ -111,6 +121,7 @@ def backpropagate_ray(
                 g_log_tau,
                 gradients.rays,
             )
+    end_decoder(buffers, gradients.density, gradients.basis)
 
 
 @parallel
@@ -135,7 +146,7 @@ def backpropagate(planes, density, volume, rays, basis, targets, distortion, gra
         targets: (N, 3) float32.
         distortion: float32, weight of the distortion loss.
         gradients: `Gradients`, added to; it has as many workers as the batch is divided among.
-        peaks: (workers, Nz, Ny, Nx) float32, raised to the largest weight that a sample in each cell has.
+        peaks: (workers, Nz, Ny, Nx) float32, raised to the largest weight above LEAST_PEAK of a sample in each cell.
         capacity: the most samples that a ray can have.
 
     Returns:
@@ -148,14 +159,22 @@ def backpropagate(planes, density, volume, rays, basis, targets, distortion, gra
     scale = np.float32(2.0 / (3.0 * N))
     shared = basis.shape[0] == 1
     for worker in prange(workers):
-        buffers = new_ray_buffers(planes.table, planes.channels, capacity)
+        buffers = new_ray_buffers(planes, capacity)
         for i in range(worker, N, workers):
-            count, trans = march_ray(
-                planes, density, volume, rays.origins[i], rays.directions[i], rays.times[i], rays.jitters[i], buffers
-            )
             b, background = (basis[0] if shared else basis[i]), rays.backgrounds[i]
+            set_decoder(buffers, density, b)
+            count, trans = march_ray(
+                planes,
+                density[-1],
+                volume,
+                rays.origins[i],
+                rays.directions[i],
+                rays.times[i],
+                rays.jitters[i],
+                buffers,
+            )
             red, green, blue = shade_ray(
-                buffers, count, b, trans * background[0], trans * background[1], trans * background[2]
+                buffers, count, trans * background[0], trans * background[1], trans * background[2]
             )
             e0, e1, e2 = red - targets[i, 0], green - targets[i, 1], blue - targets[i, 2]
             errors[i] = e0 * e0 + e1 * e1 + e2 * e2
@@ -174,11 +193,9 @@ def backpropagate(planes, density, volume, rays, basis, targets, distortion, gra
             )
             backpropagate_ray(
                 planes,
-                density,
                 volume,
                 rays.origins[i],
                 rays.directions[i],
-                b,
                 buffers,
                 count,
                 trans,

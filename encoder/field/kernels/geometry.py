@@ -118,21 +118,6 @@ def motion_corner(i, ft, fz, fy, fx):
 
 
 @inlined
-def displace(motion, u, v, w, time):
-    """Return u + D(u, time), `kpc.format.scene.motion.displace`; `texel_and_fraction` clamps it to [0, 1] later."""
-    if motion.shape[0] == 0:
-        return u, v, w
-    t, z, y, x, ft, fz, fy, fx = motion_cell(motion, u, v, w, time)
-    for i in range(16):
-        dt, dz, dy, dx, weight = motion_corner(i, ft, fz, fy, fx)
-        offset = motion[t + dt, z + dz, y + dy, x + dx]
-        u += weight * offset[0]
-        v += weight * offset[1]
-        w += weight * offset[2]
-    return u, v, w
-
-
-@inlined
 def add_displacement_slopes(motion, u, v, w, time, g):
     """Add to g (4,), the gradient of displaced u and of time, what the displacement at u and time contributes."""
     if motion.shape[0] == 0:
@@ -190,15 +175,3 @@ def add_ray_gradient(origin, direction, t, aabb, inverse, uniform_distance, g, g
     out[4] += t * gy
     out[5] += t * gz
     out[6] += g[3]
-
-
-@inlined
-def scatter_displacement(g_motion, u, v, w, time, g):
-    """Add the gradient of the motion grid, given g (3,), that of the displaced u: the transpose of `displace`."""
-    t, z, y, x, ft, fz, fy, fx = motion_cell(g_motion, u, v, w, time)
-    for i in range(16):
-        dt, dz, dy, dx, weight = motion_corner(i, ft, fz, fy, fx)
-        out = g_motion[t + dt, z + dz, y + dy, x + dx]
-        out[0] += weight * g[0]
-        out[1] += weight * g[1]
-        out[2] += weight * g[2]

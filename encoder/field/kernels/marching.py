@@ -1,7 +1,5 @@
 """One ray through the field, rendering of batches, and lists of the samples that rays take."""
 
-import math
-
 import numpy as np
 from numba import prange
 
@@ -15,7 +13,8 @@ from kpc.encoder.field.kernels.geometry import (
     ray_point,
     ray_span,
 )
-from kpc.encoder.field.kernels.planes import combine_planes, dot, sample_displaced
+from kpc.encoder.field.kernels.planes import place_sample, sample_displaced
+from kpc.encoder.field.kernels.vectors import WIDE, absorb, decode, dot, sigmoids
 from kpc.format.container.scene_layout import SAMPLE_LIMIT
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION
 
@@ -25,6 +24,9 @@ END_TRANSMITTANCE = np.float32(TERMINATION)
 # No ray takes more steps, whatever its numbers are, so that every kernel ends and Ctrl-C is heard.
 MOST_STEPS = SAMPLE_LIMIT + 2
 
+# Samples that a ray takes at a time.
+BLOCK = WIDE
+
 # A sample of less weight than this gets no colour, nor one of so little that all samples of its ray could not make up
 # half of an 8-bit level.
 NEGLIGIBLE = np.float32(1e-4)
@@ -32,57 +34,57 @@ HALF_LEVEL = np.float32(0.5 / 255)
 
 
 @plain
-def new_ray_buffers(table, M, capacity):
+def new_ray_buffers(planes, capacity):
     """Return `RayBuffers` for `capacity` samples."""
-    S = table.shape[0]
+    S, M = planes.places.shape[0], planes.channels
+    capacity += BLOCK
     return RayBuffers(
-        np.ones((capacity, S * 6 * M), np.float32),
+        np.empty((capacity, S * 6 * M), np.float32),
         np.empty((capacity, S * M), np.float32),
-        np.empty((capacity, 7), np.float32),
-        np.empty((capacity, S * 6), np.int64),
-        np.empty((capacity, S * 4), np.float32),
+        np.empty((capacity, 8), np.float32),
         np.empty(capacity, np.float32),
         np.empty(capacity, np.float32),
         np.empty(capacity, np.float32),
         np.empty(capacity, np.float32),
-        np.empty((capacity, 3), np.float32),
+        np.empty((capacity, 4), np.float32),
         np.empty(capacity, np.float32),
-        np.empty(S * M, np.float32),
-        np.empty(6 * M, np.float32),
-        np.empty(4 * M, np.float32),
+        np.empty((1, S * M), np.float32),
+        np.empty(4 * S * M, np.float32),
+        np.empty(4 * S * M, np.float32),
         np.empty(4, np.float32),
-        np.ones(M, np.float32),
     )
 
 
 @inlined
-def decode_density(features, density):
-    """Return the clipped log density of features (F,); `density` (F + 1,) holds the weights and the bias."""
+def decode_density(features, k, density):
+    """Return the clipped log density of row k of `features` (n, F); `density` (F + 1,) holds weights and bias."""
     F = density.size - 1
-    return min(max(dot(features, density, F) + density[F], -LIMIT), LIMIT)
+    return min(max(dot(features, k * F, density, 0, F) + density[F], -LIMIT), LIMIT)
 
 
 @inlined
-def sigmoid(x):
-    """Return 1 / (1 + exp(-x))."""
-    return np.float32(1.0) / (np.float32(1.0) + math.exp(-x))
+def set_decoder(buffers, density, basis):
+    """Set buffers.decoder to the weights of the log density (F + 1,), without the bias, and of colours (3, F)."""
+    F = density.size - 1
+    for i in range(F):
+        buffers.decoder[i] = density[i]
+    for c in range(3):
+        for i in range(F):
+            buffers.decoder[(c + 1) * F + i] = basis[c, i]
 
 
-@bare
-def march_ray(planes, density, volume, origin, direction, time, jitter, buffers):
-    """March a ray until it leaves the volume or its transmittance falls below TERMINATION; fill the buffers.
+@inlined
+def find_samples(volume, occupied, span, origin, direction, time, jitter, buffers, first, k):
+    """Write the next occupied samples of a ray, BLOCK at most, to the buffers from `first` on.
+
+    buffers.taus is set to the thickness per density. `span` is from `ray_span`, `k` the step to begin with.
 
     Returns:
-        The number of occupied samples, and the transmittance behind them.
+        The number of samples, and the step to go on with.
     """
-    near, far = ray_span(origin, direction, volume.aabb, volume.uniform_distance)
-    slots = volume.occupancy.shape[0]
-    occupied = volume.occupancy[min(int(time * slots), slots - 1)]
-    inverse = inverse_edges(volume.aabb)
-    trans = np.float32(1.0)
-    count = 0
-    k = 0
-    while count < buffers.weights.size and k < MOST_STEPS:
+    (near, far), inverse = span, inverse_edges(volume.aabb)
+    count, room = 0, min(BLOCK, buffers.weights.size - BLOCK - first)
+    while count < room and k < MOST_STEPS:
         s = near + (np.float32(k) + jitter) * volume.step
         k += 1
         if not s < far:
@@ -91,19 +93,46 @@ def march_ray(planes, density, volume, origin, direction, time, jitter, buffers)
         u, v, w, radius = ray_point(origin, direction, t, volume.aabb, inverse, volume.uniform_distance)
         if occupied[cell_index(occupied, u, v, w)] == 0:
             continue
-        sample_displaced(planes, u, v, w, time, buffers, count)
-        combine_planes(buffers.values[count], planes.table.shape[0], planes.channels, buffers.features[count])
-        log_density = decode_density(buffers.features[count], density)
+        place_sample(buffers, first + count, u, v, w, time)
+        buffers.s[first + count] = s
         scale = density_scale(t, radius, volume.uniform_distance)
-        tau = math.exp(log_density) * (volume.step * scale) / volume.extent
-        alpha = np.float32(1.0) - math.exp(-tau)
-        buffers.s[count], buffers.log_densities[count], buffers.taus[count] = s, log_density, tau
-        buffers.weights[count] = trans * alpha
-        trans *= np.float32(1.0) - alpha
+        buffers.taus[first + count] = volume.step * scale / volume.extent
         count += 1
-        if trans < END_TRANSMITTANCE:
-            break
-    return count, trans
+    return count, k
+
+
+@bare
+def march_ray(planes, bias, volume, origin, direction, time, jitter, buffers):
+    """March a ray until it leaves the volume or its transmittance falls below TERMINATION; fill the buffers.
+
+    It follows `set_decoder`; `bias` is that of the log density. Samples are taken in blocks, each in several passes:
+    one sample after the other, the processor would mostly wait for results.
+
+    Returns:
+        The number of occupied samples, and the transmittance behind them.
+    """
+    span = ray_span(origin, direction, volume.aabb, volume.uniform_distance)
+    slots = volume.occupancy.shape[0]
+    occupied = volume.occupancy[min(int(time * slots), slots - 1)]
+    trans, count, k = np.float32(1.0), 0, 0
+    while True:
+        found, k = find_samples(volume, occupied, span, origin, direction, time, jitter, buffers, count, k)
+        end = count + found
+        for i in range(count, end):
+            sample_displaced(planes, buffers, i, buffers.features, i)
+        for i in range(count, end):
+            decode(buffers.decoder, buffers.features, i, buffers.features.shape[1], buffers.decoded)
+            buffers.log_densities[i] = min(max(buffers.decoded[i, 0] + bias, -LIMIT), LIMIT)
+        absorb(buffers.log_densities, buffers.taus, buffers.weights, count)
+        while count < end:
+            alpha = buffers.weights[count]
+            buffers.weights[count] = trans * alpha
+            trans *= np.float32(1.0) - alpha
+            count += 1
+            if trans < END_TRANSMITTANCE:
+                return count, trans
+        if found < BLOCK:
+            return count, trans
 
 
 @inlined
@@ -113,22 +142,21 @@ def negligible_weight(count):
 
 
 @bare
-def shade_ray(buffers, count, basis, red, green, blue):
+def shade_ray(buffers, count, red, green, blue):
     """Add the samples of a ray after `march_ray` to a colour; keep their colours in the buffers.
 
     C = (red, green, blue) + sum_k w_k sigmoid(basis . features_k),   basis (3, F)
     """
-    F, negligible = buffers.g_features.size, negligible_weight(count)
+    negligible = negligible_weight(count)
     for k in range(count):
-        colour, weight = buffers.colours[k], buffers.weights[k]
+        colour, weight = buffers.decoded[k], buffers.weights[k]
         if weight > negligible:
-            for c in range(3):
-                colour[c] = sigmoid(dot(buffers.features[k], basis[c], F))
+            sigmoids(buffers.decoded, k)
         else:
-            colour[0] = colour[1] = colour[2] = np.float32(0.0)
-        red += weight * colour[0]
-        green += weight * colour[1]
-        blue += weight * colour[2]
+            colour[1] = colour[2] = colour[3] = np.float32(0.0)
+        red += weight * colour[1]
+        green += weight * colour[2]
+        blue += weight * colour[3]
     return red, green, blue
 
 
@@ -154,13 +182,21 @@ def render(planes, density, volume, rays, basis, capacity, workers):
     depths = np.empty(N, np.float32)
     counts = np.empty(N, np.int32)
     for worker in prange(workers):
-        buffers = new_ray_buffers(planes.table, planes.channels, capacity)
+        buffers = new_ray_buffers(planes, capacity)
         for i in range(worker, N, workers):
+            set_decoder(buffers, density, basis[i])
             count, trans = march_ray(
-                planes, density, volume, rays.origins[i], rays.directions[i], rays.times[i], rays.jitters[i], buffers
+                planes,
+                density[-1],
+                volume,
+                rays.origins[i],
+                rays.directions[i],
+                rays.times[i],
+                rays.jitters[i],
+                buffers,
             )
             depth = np.float32(0.0)
-            rgb = shade_ray(buffers, count, basis[i], np.float32(0.0), np.float32(0.0), np.float32(0.0))
+            rgb = shade_ray(buffers, count, np.float32(0.0), np.float32(0.0), np.float32(0.0))
             for c in range(3):
                 rgbs[i, c] = rgb[c] + trans * rays.backgrounds[i, c]
             for k in range(count):

@@ -6,13 +6,12 @@ from numba import prange
 from kpc.encoder.field.kernels.compilation import parallel
 from kpc.encoder.field.kernels.marching import decode_density, new_ray_buffers
 from kpc.encoder.field.kernels.planes import (
-    combine_planes,
-    point_gradient,
+    place_sample,
     sample_displaced,
-    scatter_motion,
     scatter_planes,
     undisplace_gradient,
 )
+from kpc.encoder.field.kernels.texels import displace_transpose
 
 
 @parallel
@@ -21,24 +20,24 @@ def log_densities(planes, density, points, times, workers):
     N = points.shape[0]
     out = np.empty(N, np.float32)
     for worker in prange(workers):
-        buffers = new_ray_buffers(planes.table, planes.channels, 1)
+        buffers = new_ray_buffers(planes, 1)
         for i in range(worker, N, workers):
-            sample_displaced(planes, points[i, 0], points[i, 1], points[i, 2], times[i], buffers, 0)
-            combine_planes(buffers.values[0], planes.table.shape[0], planes.channels, buffers.features[0])
-            out[i] = decode_density(buffers.features[0], density)
+            place_sample(buffers, 0, points[i, 0], points[i, 1], points[i, 2], times[i])
+            sample_displaced(planes, buffers, 0, buffers.features, 0)
+            out[i] = decode_density(buffers.features, 0, density)
     return out
 
 
 @parallel
 def features(planes, points, times, workers):
     """Return `kpc.encoder.field.field.Field.features` at u (N, 3) in [0, 1]^3 and times (N,): (N, F) float32."""
-    N, S, M = points.shape[0], planes.table.shape[0], planes.channels
-    out = np.empty((N, S * M), np.float32)
+    N, F = points.shape[0], planes.places.shape[0] * planes.channels
+    out = np.empty((N, F), np.float32)
     for worker in prange(workers):
-        buffers = new_ray_buffers(planes.table, M, 1)
+        buffers = new_ray_buffers(planes, 1)
         for i in range(worker * N // workers, (worker + 1) * N // workers):
-            sample_displaced(planes, points[i, 0], points[i, 1], points[i, 2], times[i], buffers, 0)
-            combine_planes(buffers.values[0], S, M, out[i])
+            place_sample(buffers, 0, points[i, 0], points[i, 1], points[i, 2], times[i])
+            sample_displaced(planes, buffers, 0, out, i)
     return out
 
 
@@ -55,14 +54,13 @@ def scatter_features(planes, g_theta, g_motion, g_points, points, times, g):
     """
     N, workers, wants_motion, wants_points = points.shape[0], g_theta.shape[0], g_motion.size > 0, g_points.size > 0
     for worker in prange(workers):
-        buffers = new_ray_buffers(planes.table, planes.channels, 1)
+        buffers = new_ray_buffers(planes, 1)
         for i in range(worker * N // workers, (worker + 1) * N // workers):
-            sample_displaced(planes, points[i, 0], points[i, 1], points[i, 2], times[i], buffers, 0)
-            scatter_planes(planes, g_theta[worker], g[i], buffers, 0, wants_motion or wants_points, wants_points)
-            if wants_motion or wants_points:
-                point_gradient(buffers, 0)
+            place_sample(buffers, 0, points[i, 0], points[i, 1], points[i, 2], times[i])
+            sample_displaced(planes, buffers, 0, buffers.features, 0)
+            scatter_planes(planes, g_theta[worker], g, i, buffers, 0, wants_motion or wants_points)
             if wants_motion:
-                scatter_motion(g_motion[worker], buffers, 0)
+                displace_transpose(g_motion[worker], buffers.points, 0, buffers.g_point)
             if wants_points:
                 undisplace_gradient(planes.motion, buffers, 0)
                 for axis in range(4):  # an array assigned to a row would have its message about shapes compiled

@@ -1,0 +1,302 @@
+"""The texels of planes and the nodes of a motion grid around a point, by vectors over channels.
+
+Each intrinsic does what a sample needs of one scale at once, so that the numbers of six planes stay in the processor's
+registers. A place is an array and a position in it, which counts its numbers from the beginning: (array, int64).
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from kpc.encoder.field.kernels.vectors import WIDE, runs
+from kpc.vectors import (
+    FLOAT,
+    INDEX,
+    LANE,
+    added,
+    array_data,
+    array_of,
+    clamped,
+    constant,
+    folded,
+    for_each_vector,
+    load,
+    picked,
+    product,
+    spread,
+    store,
+    vector_type,
+)
+
+# The axes of the planes xy xz yz xt yt zt along their columns and rows, as positions in "xyzt".
+AXES = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
+
+# Columns of each half of `PlaneSet.places`.
+PLACES = 8
+
+
+def _texel_and_share(builder: Any, point: Any, interval: Any) -> tuple[Any, Any]:
+    """Return, for four coordinates in [0, 1], the texel below and the share of the way to the next.
+
+    Coordinates beyond are clamped, and NaN is 0: a texel must lie in the plane.
+    """
+    nothing, one = constant(0.0, 4), constant(1.0, 4)
+    position = builder.fmul(point, interval)
+    below = clamped(builder, position, nothing, builder.fsub(interval, one))
+    texel = builder.fptosi(below, vector_type(4, LANE))
+    return texel, clamped(builder, builder.fsub(position, builder.sitofp(texel, vector_type(4))), nothing, one)
+
+
+class _Scale:
+    """What the intrinsics of one scale have in common, unpacked from their first seven arguments.
+
+    Attributes:
+        texels: for each plane, pointers to the four texels around the point.
+        shares: float32, along x, y, z, t, of the way to the next texel.
+        intervals: four float32, between texels along each axis.
+        channels: M.
+    """
+
+    def __init__(self, context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> None:
+        grid, number, point, self.channels, _, values, features = arguments[:7]
+        self.builder = builder
+        of_grid, _, of_point, _, planes, of_values, of_features = signature.args[:7]
+        data, places, intervals = (
+            array_data(context, builder, kind, array)
+            for kind, array in zip(of_grid, cgutils.unpack_tuple(builder, grid), strict=True)
+        )
+        point, self._values, self._features = (
+            _place(context, builder, kind, place)
+            for kind, place in ((of_point, point), (of_values, values), (of_features, features))
+        )
+        self.intervals = load(builder, intervals, builder.mul(number, INDEX(4)), 4)
+        texel, share = _texel_and_share(builder, load(builder, point, INDEX(0), 4), self.intervals)
+        self.shares = [builder.extract_element(share, LANE(axis)) for axis in range(4)]
+        at = builder.mul(number, INDEX(2 * PLACES))
+        first, per_row = (load(builder, places, builder.add(at, INDEX(n)), PLACES, LANE) for n in (0, PLACES))
+        column, row = (picked(builder, texel, texel, [axes[n] for axes in AXES] + [0, 0]) for n in (0, 1))
+        first = builder.add(first, builder.add(builder.mul(row, per_row), column))
+        self.texels = []
+        for c in range(planes.literal_value):
+            start, below = (
+                builder.mul(builder.sext(builder.extract_element(vector, LANE(c)), INDEX), self.channels)
+                for vector in (first, per_row)
+            )
+            self.texels.append([builder.gep(data, [run]) for run in runs(builder, start, below, self.channels)])
+
+    def planes(self, m: Any, wide: int) -> Iterator[tuple[list[Any], Any, Any]]:
+        """Yield, for each plane, pointers to its texels from channel m on, and the shares along columns and rows."""
+        shares = [spread(self.builder, share, wide) for share in self.shares]
+        for texels, (column_axis, row_axis) in zip(self.texels, AXES, strict=False):
+            yield [self.builder.gep(texel, [m]) for texel in texels], shares[column_axis], shares[row_axis]
+
+    def value(self, c: int, m: Any) -> Any:
+        """Return a pointer to channel m of what plane c holds at the point."""
+        return self.builder.gep(self._values, [self.builder.add(self.builder.mul(self.channels, INDEX(c)), m)])
+
+    def feature(self, m: Any) -> Any:
+        """Return a pointer to channel m of the product over planes, or of its gradient."""
+        return self.builder.gep(self._features, [m])
+
+    def gradients(self, m: Any, wide: int) -> list[Any]:
+        """Return the gradient of channel m of what each plane holds at the point."""
+        builder = self.builder
+        values = [load(builder, self.value(c, m), INDEX(0), wide) for c in range(len(self.texels))]
+        before = [load(builder, self.feature(m), INDEX(0), wide)]  # times the values of the planes before
+        for value in values[:-1]:
+            before.append(product(builder, before[-1], value))
+        gradients, behind = [before[-1]], values[-1]  # product of the values of the planes behind
+        for c in reversed(range(len(values) - 1)):
+            gradients.append(product(builder, before[c], behind))
+            behind = product(builder, values[c], behind)
+        return gradients[::-1]
+
+
+def _placed(kind: Any) -> Any:
+    """Return the type of an array and a place in it."""
+    return types.Tuple((kind[0], types.int64))
+
+
+def _place(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    """Return a pointer to a place in an array."""
+    array, at = cgutils.unpack_tuple(builder, value)
+    return builder.gep(array_data(context, builder, kind[0], array), [at])
+
+
+def _between(builder: Any, a: Any, b: Any, share: Any) -> Any:
+    """Return a + share (b - a)."""
+    return added(builder, a, product(builder, share, builder.fsub(b, a)))
+
+
+@intrinsic(prefer_literal=True)
+def sample_scale(
+    _: Any, grid: Any, scale: Any, point: Any, channels: Any, planes: Any, values: Any, features: Any
+) -> Any:
+    """Sample the planes of one scale at a point, and multiply what they hold.
+
+    values[c M + m] is set to channel m of plane c, and features[m] to the product over planes.
+
+    Args:
+        grid: theta, `PlaneSet.places` and `PlaneSet.intervals`.
+        scale: int64.
+        point: place of u, v, w and the time, each in [0, 1] or clamped to it.
+        channels: int64, M.
+        planes: 6, or 3 in a static scene; a constant.
+        values, features: places.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        at = _Scale(context, builder, signature, arguments)
+
+        def emit(m: Any, wide: int) -> None:
+            held = []
+            for texels, fc, fr in at.planes(m, wide):
+                a, b, c, d = (load(builder, texel, INDEX(0), wide) for texel in texels)
+                held.append(_between(builder, _between(builder, a, b, fc), _between(builder, c, d, fc), fr))
+            for n, value in enumerate(held):
+                store(builder, value, at.value(n, m), INDEX(0))
+            store(builder, product(builder, *held), at.feature(m), INDEX(0))
+
+        for_each_vector(builder, at.channels, WIDE, emit)
+        return context.get_dummy_value()
+
+    whole = types.int64
+    return types.void(grid, whole, _placed(point), whole, planes, _placed(values), _placed(features)), generate
+
+
+@intrinsic(prefer_literal=True)
+def scatter_scale(
+    _: Any, grid: Any, scale: Any, point: Any, channels: Any, planes: Any, values: Any, g_features: Any
+) -> Any:
+    """Add the gradient of the planes of one scale, given that of the product over planes: `sample_scale`'s transpose.
+
+    Args:
+        grid: the gradient of theta, `PlaneSet.places` and `PlaneSet.intervals`.
+        scale, point, channels, planes, values: as of `sample_scale`.
+        g_features: place of M numbers.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        at = _Scale(context, builder, signature, arguments)
+
+        def emit(m: Any, wide: int) -> None:
+            for gradient, (texels, fc, fr) in zip(at.gradients(m, wide), at.planes(m, wide), strict=True):
+                lower = product(builder, fr, gradient)
+                parts = []
+                for row in (builder.fsub(gradient, lower), lower):
+                    right = product(builder, fc, row)
+                    parts += [builder.fsub(row, right), right]
+                held = [load(builder, texel, INDEX(0), wide) for texel in texels]
+                for texel, number, part in zip(texels, held, parts, strict=True):
+                    store(builder, added(builder, number, part), texel, INDEX(0))
+
+        for_each_vector(builder, at.channels, WIDE, emit)
+        return context.get_dummy_value()
+
+    whole = types.int64
+    return types.void(grid, whole, _placed(point), whole, planes, _placed(values), _placed(g_features)), generate
+
+
+@intrinsic(prefer_literal=True)
+def add_slopes(
+    _: Any, grid: Any, scale: Any, point: Any, channels: Any, planes: Any, values: Any, g_features: Any, g_point: Any
+) -> Any:
+    """Add the gradient of the point's coordinates by way of one scale to g_point (4,).
+
+    The other parameters are those of `scatter_scale`, but for `grid`, which is that of `sample_scale`.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        at = _Scale(context, builder, signature, arguments)
+        g_point = array_of(context, builder, signature, arguments, 7).data
+
+        def emit(m: Any, wide: int) -> None:
+            slopes = [constant(0.0, wide)] * 4
+            planes = zip(at.gradients(m, wide), at.planes(m, wide), AXES, strict=False)
+            for gradient, (texels, fc, fr), (column_axis, row_axis) in planes:
+                a, b, c, d = (load(builder, texel, INDEX(0), wide) for texel in texels)
+                along = _between(builder, builder.fsub(b, a), builder.fsub(d, c), fr)
+                across = _between(builder, builder.fsub(c, a), builder.fsub(d, b), fc)
+                for axis, slope in ((column_axis, along), (row_axis, across)):
+                    slopes[axis] = added(builder, slopes[axis], product(builder, gradient, slope))
+            total = ir.Constant(vector_type(4), ir.Undefined)
+            for axis, slope in enumerate(slopes):
+                number = builder.extract_element(folded(builder, slope, wide, 1), LANE(0))
+                total = builder.insert_element(total, number, LANE(axis))
+            held = load(builder, g_point, INDEX(0), 4)
+            store(builder, added(builder, held, product(builder, at.intervals, total)), g_point, INDEX(0))
+
+        for_each_vector(builder, at.channels, WIDE, emit)
+        return context.get_dummy_value()
+
+    whole = types.int64
+    places = _placed(point), whole, planes, _placed(values), _placed(g_features)
+    return types.void(grid, whole, *places, g_point), generate
+
+
+def _motion_corners(context: Any, builder: Any, kind: Any, grid: Any, points: Any, at: Any) -> list[tuple[Any, Any]]:
+    """Return the 16 nodes of a motion grid around a point, whose coordinates begin at `at`: pointers and weights."""
+    grid = context.make_array(kind)(context, builder, grid)
+    sizes = cgutils.unpack_tuple(builder, grid.shape)[3::-1]  # along x, y, z, t
+    interval = constant(0.0, 4)
+    for axis, size in enumerate(sizes):
+        number = builder.sitofp(builder.sub(size, INDEX(1)), FLOAT)
+        interval = builder.insert_element(interval, number, LANE(axis))
+    texel, share = _texel_and_share(builder, load(builder, points, at, 4), interval)
+    first, stride, strides = INDEX(0), INDEX(3), []
+    for axis, size in enumerate(sizes):
+        lower = builder.sext(builder.extract_element(texel, LANE(axis)), INDEX)
+        first = builder.add(first, builder.mul(lower, stride))
+        strides.append(stride)
+        stride = builder.mul(stride, size)
+    nodes = [(first, ir.Constant(FLOAT, 1.0))]
+    for axis in reversed(range(4)):
+        on = builder.extract_element(share, LANE(axis))
+        back = builder.fsub(ir.Constant(FLOAT, 1.0), on)
+        nodes = [
+            (builder.add(node, strides[axis]) if further else node, builder.fmul(weight, on if further else back))
+            for node, weight in nodes
+            for further in (False, True)
+        ]
+    return [(builder.gep(grid.data, [node]), weight) for node, weight in nodes]
+
+
+@intrinsic
+def displace(_: Any, motion: Any, points: Any, k: Any) -> Any:
+    """Set points[k, :3] to points[k, 4:7] + D: `kpc.format.scene.motion.displace` of points[k, 4:8], u and time.
+
+    Args:
+        motion: (T, Nz, Ny, Nx, 3) float32, at least two along each axis. points: (n, 8) float32. k: int64.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        points = array_of(context, builder, signature, arguments, 1).data
+        at = builder.mul(arguments[2], INDEX(8))
+        undisplaced = builder.add(at, INDEX(4))
+        terms = [load(builder, points, undisplaced, 3)]
+        for node, weight in _motion_corners(context, builder, signature.args[0], arguments[0], points, undisplaced):
+            terms.append(product(builder, spread(builder, weight, 3), load(builder, node, INDEX(0), 3)))
+        store(builder, added(builder, *terms), points, at)
+        return context.get_dummy_value()
+
+    return types.void(motion, points, types.int64), generate
+
+
+@intrinsic
+def displace_transpose(_: Any, g_motion: Any, points: Any, k: Any, g: Any) -> Any:
+    """Add the gradient of the motion grid, given g (3,) or longer, that of points[k, :3] of `displace`."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        points, g = (array_of(context, builder, signature, arguments, n).data for n in (1, 3))
+        gradient = load(builder, g, INDEX(0), 3)
+        at = builder.add(builder.mul(arguments[2], INDEX(8)), INDEX(4))
+        for node, weight in _motion_corners(context, builder, signature.args[0], arguments[0], points, at):
+            term = product(builder, spread(builder, weight, 3), gradient)
+            store(builder, added(builder, load(builder, node, INDEX(0), 3), term), node, INDEX(0))
+        return context.get_dummy_value()
+
+    return types.void(g_motion, points, types.int64, g), generate
