@@ -1,4 +1,4 @@
-"""Fixtures that the tests of kprender share."""
+"""Fixtures that tests of commands share."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -7,11 +7,13 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import pytest
 from distributed import Client, LocalCluster
 
@@ -48,6 +50,32 @@ def threads() -> Iterator[Client]:
         Client(cluster) as client,
     ):
         yield client
+
+
+@pytest.fixture
+def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The address of an empty place on a server such as S3, on this machine."""
+    needed = "s3fs, moto, flask and flask-cors"
+    for package in ("s3fs", "flask_cors", "moto.server"):
+        pytest.importorskip(package, reason=f"needs {needed}, which the extra test installs")
+    from moto.server import ThreadedMotoServer
+
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    for name, value in {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "some",
+        "AWS_SECRET_ACCESS_KEY": "thing",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_EC2_METADATA_DISABLED": "true",
+    }.items():
+        monkeypatch.setenv(name, value)
+    fsspec.get_filesystem_class("s3").clear_instance_cache()
+    name = f"bucket-{uuid.uuid4().hex}"  # the server's memory outlives it
+    fsspec.filesystem("s3").mkdir(name)
+    yield f"s3://{name}/place"
+    server.stop()
 
 
 def write(tmp_path: Path, text: str) -> Path:
@@ -128,9 +156,10 @@ def test_an_address_follows_content_options_and_group(take: Path) -> None:
     assert not {*before} & {*keys(("--seed=1", "--quality=40"))}
 
 
-@pytest.mark.parametrize("address", ["{}", "file://{}", "memory://{}"])
-def test_a_store_holds_whole_files(tmp_path: Path, address: str) -> None:
-    store, file = Store(address.format(tmp_path / "store")), tmp_path / "file"
+@pytest.mark.parametrize("address", ["{}", "file://{}", "memory://{}", "s3"])
+def test_a_store_holds_whole_files(tmp_path: Path, address: str, request: pytest.FixtureRequest) -> None:
+    place = request.getfixturevalue("bucket") if address == "s3" else address.format(tmp_path / "store")
+    store, file = Store(place), tmp_path / "file"
     file.write_bytes(b"content")
     store.put(file, f"key/{WORK}/deep/a")
     store.put_json({"a": 1}, "key/result.json")
@@ -144,6 +173,39 @@ def test_a_store_holds_whole_files(tmp_path: Path, address: str) -> None:
     store.remove("key")
     store.remove("key")
     assert not store.exists("key/result.json")
+
+
+def test_a_batch_reads_and_writes_addresses(bucket: str, scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file at an address is coded again by a worker process, its result written there, and not made again."""
+    fs, root = fsspec.core.url_to_fs(bucket)
+    fs.put_file(str(scene_file), f"{root}/in/take.kpc")
+    command = [
+        f"{bucket}/in/take.kpc",
+        "-o",
+        f"{bucket}/out",
+        "--workers",
+        "1",
+        "--",
+        "--quality",
+        "20",
+        "--tune-steps",
+        "0",
+    ]
+    assert main(command) == 0, capsys.readouterr()
+    written = fs.info(f"{root}/out/take.kpc")
+    assert 0 < written["size"] < scene_file.stat().st_size
+    assert json.loads(fs.cat_file(f"{root}/out/take.json"))["size_bytes"] == written["size"]
+    assert main(command) == 0
+    assert fs.info(f"{root}/out/take.kpc")["LastModified"] == written["LastModified"]
+
+
+def test_a_store_that_needs_credentials_is_one_line(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    fsspec.get_filesystem_class("s3").clear_instance_cache()
+    with pytest.raises(StoreError, match=r"^s3://.*redentials") as error:
+        Store(bucket).put_text("text", "name")
+    assert "\n" not in str(error.value)
 
 
 def test_a_store_of_an_unknown_kind_is_one_line() -> None:

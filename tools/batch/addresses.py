@@ -16,6 +16,7 @@ import fsspec
 
 from kpc.format.common.errors import UsageError
 from kpc.format.common.media_files import is_hidden
+from kpc.tools.batch.store import reason
 
 # Packages whose code decides what a result is.
 CODE = ("kpc.encoder", "kpc.format")
@@ -54,8 +55,8 @@ def source_address(source: str) -> str:
             with file.open("rb") as opened:
                 digest.update(os.fsencode(name) + b"\0" + hashlib.file_digest(opened, "sha256").digest())
         return digest.hexdigest()[:LENGTH]
-    except (OSError, ValueError, ImportError) as error:
-        raise UsageError(f"{source}: {getattr(error, 'strerror', None) or error}") from error
+    except Exception as error:
+        raise UsageError(f"{source}: {reason(error)}") from error
 
 
 def _folder_of(package: str) -> str:

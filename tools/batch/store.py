@@ -25,6 +25,12 @@ class StoreError(KpcError):
     """The shared place cannot be read or written."""
 
 
+def reason(error: Exception) -> str:
+    """Return in a line why a file system of fsspec failed: many raise errors of their own, not only OSError."""
+    said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return " ".join(said.split()) or type(error).__name__
+
+
 class Store:
     """Files below a folder or an address. What is written appears whole or not at all."""
 
@@ -38,10 +44,8 @@ class Store:
         try:
             self._fs, self._root = fsspec.core.url_to_fs(address)
             self._fs.makedirs(self._root, exist_ok=True)
-        except (ValueError, ImportError) as error:
-            raise StoreError(f"{address}: {error}") from error
-        except OSError as error:
-            raise StoreError(f"{address}: {error.strerror or error}") from error
+        except Exception as error:
+            raise StoreError(f"{address}: {reason(error)}") from error
 
     def exists(self, name: str) -> bool:
         with self._errors(name):
@@ -145,5 +149,5 @@ class Store:
             yield
         except FileNotFoundError:
             raise StoreError(f"{self.address}/{name}: no such file") from None
-        except OSError as error:
-            raise StoreError(f"{self.address}/{name}: {error.strerror or error}") from error
+        except Exception as error:
+            raise StoreError(f"{self.address}/{name}: {reason(error)}") from error
