@@ -88,7 +88,7 @@ class Panels:
         if asks:
             ask(self.actions)
         if clock.monotonic() < state.notice.until:
-            message("notice", state.notice.text, across, bottom - margin, 1.0, ERROR if state.notice.is_error else None)
+            message("notice", state.notice.text, free, bottom - margin, 1.0, ERROR if state.notice.is_error else None)
         # It lies above everything, so it waits until a menu is closed.
         if (text := state.stream.message) is not None and not imgui.is_popup_open("", imgui.PopupFlags.ANY_POPUP):
             message("stream", text, free, below, 0.0)

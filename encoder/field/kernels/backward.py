@@ -16,7 +16,7 @@ from kpc.encoder.field.kernels.marching import (
 )
 from kpc.encoder.field.kernels.planes import scatter_planes, undisplace_gradient
 from kpc.encoder.field.kernels.texels import displace_transpose
-from kpc.encoder.field.kernels.vectors import blend, blend_transpose
+from kpc.encoder.field.kernels.vectors import add_decoder_gradient, decode_transpose
 from kpc.encoder.field.occupancy_grid import OccupancyGrid
 
 # Smaller weights of samples make no cell matter.
@@ -59,14 +59,14 @@ def decoder_gradient(buffers, k, g_log, g_rgb):
     """
     F, one = buffers.features.shape[1], np.float32(1.0)
     weight, red, green, blue = buffers.weights[k], buffers.decoded[k, 1], buffers.decoded[k, 2], buffers.decoded[k, 3]
-    factors = (
+    g = (
         g_log,
         g_rgb[0] * weight * red * (one - red),
         g_rgb[1] * weight * green * (one - green),
         g_rgb[2] * weight * blue * (one - blue),
     )
-    blend(buffers.decoder, 0, 2 * F, factors, F, buffers.g_features, 0)
-    blend_transpose(buffers.g_decoder, 0, 2 * F, factors, F, buffers.features, k * F)
+    decode_transpose(buffers.decoder, g, F, buffers.g_features)
+    add_decoder_gradient(buffers.g_decoder, g, F, buffers.features, k)
 
 
 @bare

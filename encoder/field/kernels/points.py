@@ -4,7 +4,7 @@ import numpy as np
 from numba import prange
 
 from kpc.encoder.field.kernels.compilation import parallel
-from kpc.encoder.field.kernels.marching import decode_density, new_ray_buffers
+from kpc.encoder.field.kernels.marching import BLOCK, decode_density, new_ray_buffers
 from kpc.encoder.field.kernels.planes import (
     place_sample,
     sample_displaced,
@@ -20,11 +20,17 @@ def log_densities(planes, density, points, times, workers):
     N = points.shape[0]
     out = np.empty(N, np.float32)
     for worker in prange(workers):
-        buffers = new_ray_buffers(planes, 1)
-        for i in range(worker, N, workers):
-            place_sample(buffers, 0, points[i, 0], points[i, 1], points[i, 2], times[i])
-            sample_displaced(planes, buffers, 0, buffers.features, 0)
-            out[i] = decode_density(buffers.features, 0, density)
+        buffers = new_ray_buffers(planes, BLOCK)
+        end = (worker + 1) * N // workers
+        for first in range(worker * N // workers, end, BLOCK):
+            count = min(BLOCK, end - first)
+            for k in range(count):
+                i = first + k
+                place_sample(buffers, k, points[i, 0], points[i, 1], points[i, 2], times[i])
+            for k in range(count):
+                sample_displaced(planes, buffers, k, buffers.features, k)
+            for k in range(count):
+                out[first + k] = decode_density(buffers.features, k, density)
     return out
 
 

@@ -12,7 +12,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from kpc.encoder.field.kernels.vectors import WIDE, runs
+from kpc.encoder.field.kernels.vectors import WIDE
 from kpc.vectors import (
     FLOAT,
     INDEX,
@@ -86,7 +86,9 @@ class _Scale:
                 builder.mul(builder.sext(builder.extract_element(vector, LANE(c)), INDEX), self.channels)
                 for vector in (first, per_row)
             )
-            self.texels.append([builder.gep(data, [run]) for run in runs(builder, start, below, self.channels)])
+            rows = start, builder.add(start, below)
+            places = [place for row in rows for place in (row, builder.add(row, self.channels))]
+            self.texels.append([builder.gep(data, [place]) for place in places])
 
     def planes(self, m: Any, wide: int) -> Iterator[tuple[list[Any], Any, Any]]:
         """Yield, for each plane, pointers to its texels from channel m on, and the shares along columns and rows."""

@@ -35,68 +35,6 @@ WIDE = 8
 _FOUR = types.UniTuple(types.float32, 4)
 
 
-def runs(builder: Any, first: Any, below: Any, count: Any) -> list[Any]:
-    """Return where four runs of `count` numbers begin: two, one after the other, and two more `below` behind them."""
-    second_pair = builder.add(first, below)
-    return [first, builder.add(first, count), second_pair, builder.add(second_pair, count)]
-
-
-@intrinsic
-def blend(_: Any, source: Any, first: Any, below: Any, weights: Any, count: Any, out: Any, at: Any) -> Any:
-    """Set out[at + i], for i < count, to the weighted sum of number i of four runs, such as the texels around a point.
-
-    Args:
-        source: array.
-        first: int64, where the first run begins; the second follows it.
-        below: int64, distance from the first two to the others: from a row of texels to the next.
-        weights: four float32.
-        count: int64, length of a run.
-        out: array. at: int64.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        _, first, below, weights, count, _, at = arguments
-        source, out = (array_of(context, builder, signature, arguments, n).data for n in (0, 5))
-        four, weights = runs(builder, first, below, count), cgutils.unpack_tuple(builder, weights)
-
-        def emit(i: Any, wide: int) -> None:
-            terms = (
-                product(builder, spread(builder, weight, wide), load(builder, source, builder.add(run, i), wide))
-                for run, weight in zip(four, weights, strict=True)
-            )
-            store(builder, added(builder, *terms), out, builder.add(at, i))
-
-        for_each_vector(builder, count, WIDE, emit)
-        return context.get_dummy_value()
-
-    whole = types.int64
-    return types.void(source, whole, whole, _FOUR, whole, out, whole), generate
-
-
-@intrinsic
-def blend_transpose(_: Any, out: Any, first: Any, below: Any, weights: Any, count: Any, g: Any, at: Any) -> Any:
-    """Add weight * g[at + i], for i < count, to number i of each of four runs of `out`, which must not overlap."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        _, first, below, weights, count, _, at = arguments
-        out, g = (array_of(context, builder, signature, arguments, n).data for n in (0, 5))
-        four, weights = runs(builder, first, below, count), cgutils.unpack_tuple(builder, weights)
-
-        def emit(i: Any, wide: int) -> None:
-            gradient = load(builder, g, builder.add(at, i), wide)
-            places = [builder.add(run, i) for run in four]
-            held = [load(builder, out, place, wide) for place in places]
-            for place, number, weight in zip(places, held, weights, strict=True):
-                term = product(builder, spread(builder, weight, wide), gradient)
-                store(builder, added(builder, number, term), out, place)
-
-        for_each_vector(builder, count, WIDE, emit)
-        return context.get_dummy_value()
-
-    whole = types.int64
-    return types.void(out, whole, whole, _FOUR, whole, g, whole), generate
-
-
 @intrinsic
 def decode(_: Any, decoder: Any, features: Any, row: Any, count: Any, out: Any) -> Any:
     """Set out[4 row + c] to the sum over i < F of decoder[c F + i] features[row F + i], for four c.
@@ -131,6 +69,59 @@ def decode(_: Any, decoder: Any, features: Any, row: Any, count: Any, out: Any) 
 
     whole = types.int64
     return types.void(decoder, features, whole, whole, out), generate
+
+
+@intrinsic
+def decode_transpose(_: Any, decoder: Any, g: Any, count: Any, g_features: Any) -> Any:
+    """Set g_features[i], for i < F, to the sum over four c of g[c] decoder[c F + i], given the gradient g of `decode`.
+
+    Args:
+        decoder: (4 F,) float32. g: four float32. count: int64, F. g_features: (1, F) float32.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        _, g, count, _ = arguments
+        decoder, g_features = (array_of(context, builder, signature, arguments, n).data for n in (0, 3))
+        g = cgutils.unpack_tuple(builder, g)
+
+        def emit(i: Any, wide: int) -> None:
+            terms = []
+            for c, number in enumerate(g):
+                weights = load(builder, decoder, builder.add(builder.mul(count, INDEX(c)), i), wide)
+                terms.append(product(builder, spread(builder, number, wide), weights))
+            store(builder, added(builder, *terms), g_features, i)
+
+        for_each_vector(builder, count, WIDE, emit)
+        return context.get_dummy_value()
+
+    return types.void(decoder, _FOUR, types.int64, g_features), generate
+
+
+@intrinsic
+def add_decoder_gradient(_: Any, g_decoder: Any, g: Any, count: Any, features: Any, row: Any) -> Any:
+    """Add g[c] features[row F + i] to g_decoder[c F + i], for four c and i < F, given the gradient g of `decode`.
+
+    Args:
+        g_decoder: (4 F,) float32. g: four float32. count: int64, F. features: (n, F) float32. row: int64.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        _, g, count, _, row = arguments
+        g_decoder, features = (array_of(context, builder, signature, arguments, n).data for n in (0, 3))
+        g = cgutils.unpack_tuple(builder, g)
+
+        def emit(i: Any, wide: int) -> None:
+            feature = load(builder, features, builder.add(builder.mul(row, count), i), wide)
+            for c, number in enumerate(g):
+                place = builder.add(builder.mul(count, INDEX(c)), i)
+                term = product(builder, spread(builder, number, wide), feature)
+                store(builder, added(builder, load(builder, g_decoder, place, wide), term), g_decoder, place)
+
+        for_each_vector(builder, count, WIDE, emit)
+        return context.get_dummy_value()
+
+    whole = types.int64
+    return types.void(g_decoder, _FOUR, whole, features, whole), generate
 
 
 @intrinsic
