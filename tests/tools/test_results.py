@@ -164,8 +164,20 @@ def test_documents_without_paired_markers_are_refused(tmp_path: Path, text: str)
         results.marked_names(document)
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/benchmarks.md"])
-def test_committed_records_give_the_tables_of_the_documents(document: str) -> None:
+@pytest.mark.parametrize(
+    ("document", "records"),
+    [
+        ("README.md", "*.json"),
+        ("docs/benchmarks.md", "*.json"),
+        ("docs/benchmarks-earlier.md", "earlier/*.json"),
+    ],
+)
+def test_committed_records_give_the_tables_of_the_documents(document: str, records: str) -> None:
     root = Path(__file__).parents[2]
-    text = (root / document).read_text()
-    assert results.with_tables(text, results.load(sorted((root / "docs" / "bench").glob("*.json")))) == text
+    text, files = (root / document).read_text(), sorted((root / "docs" / "bench").glob(records))
+    assert files and results.with_tables(text, results.load(files)) == text
+
+
+def test_the_records_of_the_readme_come_from_one_commit() -> None:
+    files = (Path(__file__).parents[2] / "docs" / "bench").glob("*.json")
+    assert len({record["commit"] for record in results.load(files)}) == 1
