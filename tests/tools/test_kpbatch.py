@@ -1,5 +1,6 @@
 """kpbatch: jobs that are checked as a whole, results that are made once, and workers that are killed."""
 
+import errno
 import json
 import os
 import re
@@ -315,6 +316,48 @@ def test_a_worker_that_is_killed_is_replaced_and_its_task_goes_on(tmp_path: Path
     assert 30 <= len(steps) <= 32  # at most the step of each task that the killed worker was in is done twice
 
 
+def test_a_scheduler_that_is_killed_is_one_line_and_another_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "CONNECT_S", 5)
+    address, tasks = tmp_path / "scheduler.json", [task(number) for number in range(3)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    programs = []
+    for name, *words in (
+        ("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"),
+        ("dask_worker", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path / "work")),
+    ):
+        command = [sys.executable, "-m", f"distributed.cli.{name}", "--scheduler-file", str(address), *words]
+        programs.append(subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL))
+    scheduler, worker = programs
+    try:
+        while not address.exists():
+            assert scheduler.poll() is None
+            time.sleep(0.1)
+        with (
+            pytest.raises(engine.ClusterError, match="run the same command to go on"),
+            engine.remote_cluster(json.loads(address.read_text())["address"]) as client,
+        ):
+            made = Engine(lambda: client, Place(str(tmp_path)), in_steps)
+            made.add(tasks)
+            for _ in made.events():
+                if scheduler.poll() is None and (tmp_path / f"key0.3.{worker.pid}").exists():
+                    scheduler.kill()
+                    scheduler.wait()
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+    assert len(list(tmp_path.glob("key?.*"))) < 30
+    with engine.local_cluster(1, Resources()) as client:
+        made = Engine(lambda: client, Place(str(tmp_path)), in_steps)
+        made.know(done_before(Store(str(tmp_path))))
+        made.add(tasks)
+        assert sorted(event.task.key for event in made.events() if event.kind == "done") == ["key0", "key1", "key2"]
+    assert len(Store(str(tmp_path)).names("*/step*")) == 30
+    assert 30 <= len(list(tmp_path.glob("key?.*"))) <= 31  # the step in which the worker ended may be done twice
+
+
 def test_a_child_ends_with_its_worker(tmp_path: Path) -> None:
     code = (
         "import subprocess, sys, os, time\n"
@@ -401,6 +444,21 @@ def test_parts_of_a_clip_are_joined(tmp_path: Path) -> None:
     assert outcome.figures["test_psnr"] == 31.0 and outcome.figures["steps"] == 10
     assert outcome.figures["test_ssim"] is None
     assert not list((tmp_path / "scratch/kpbatch").glob("task-*"))
+
+
+def test_a_full_disk_is_a_failure_of_its_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store(str(tmp_path / "store"))
+    store.put(SAMPLE, f"key0/{SCENE}")
+    store.put_json({}, f"key0/{RESULT}")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(fsspec.get_filesystem_class("file"), "put_file", full)
+    joined = Task("joined", "clip", "clip", "join", before=("key0",))
+    outcome = working.run(joined, Place(str(tmp_path / "store"), str(tmp_path / "scratch")))
+    assert not outcome.is_done and outcome.error.endswith("scene.kpc: No space left on device")
+    assert not store.exists(f"joined/{RESULT}")
 
 
 def test_options_of_folders_are_checked(tmp_path: Path, take: Path) -> None:

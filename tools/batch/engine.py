@@ -91,6 +91,7 @@ def remote_cluster(address: str) -> Iterator[Client]:
         client = Client(address, timeout=CONNECT_S)
     except (OSError, ValueError) as error:
         raise ClusterError(f"{address}: no Dask scheduler answers; start one with dask scheduler") from error
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is in our own errors
     with client:
         yield client
 
