@@ -113,23 +113,24 @@ QUICK = Effort(
 def generated(effort: Effort) -> list[Step]:
     """Return the steps on generated scenes."""
     scenegen = ("kpc.tools.dev.scenegen",)
-    long_clip = Step("scene-long", (*scenegen, LONG, *effort.long), 0.5, (), (f"{LONG}/gt/cameras.json",), False)
+    long_clip = Step("scene-long", (*scenegen, LONG, *effort.long), 0.3, (), (f"{LONG}/gt/cameras.json",), False)
     scene = Step("scene", (*scenegen, DEFAULT, *effort.scene), 0.8, (), (f"{DEFAULT}/gt/cameras.json",), False)
     ablate_steps, scaling_steps, group_steps = map(str, effort.steps)
     main = f"kept/default-{effort.preset}"
     trained = Step(
         "encode",
         ("encode", DEFAULT, "--preset", effort.preset, *effort.encode, "--keep-scenes", "kept"),
-        11,
+        7,
         ("scene",),
         (f"{main}.kpc", f"{main}.kpck"),
     )
+    fast = Step("encode-fast", ("encode", DEFAULT, "--preset", "fast", "--keep-scenes", "kept"), 2.5, ("scene",))
     # The coder is compared on the draft, since what it searches takes longest.
     coded = "kept/default-draft" + "-0" * (effort.repeats != "1")
     draft = Step(
         "encode-draft",
         ("encode", DEFAULT, "--preset", "draft", *effort.encode, "--repeats", effort.repeats, "--keep-scenes", "kept"),
-        5.5,
+        3,
         ("scene",),
         (f"{coded}.kpck",),
     )
@@ -157,15 +158,16 @@ def generated(effort: Effort) -> list[Step]:
         scene,
         trained,
         draft,
+        *([fast] if effort is HOUR else []),
         *curves,
-        Step("ablate", ablate, 5, ("scene",)),
-        Step("scaling", ("scaling", "--steps", scaling_steps, "--repeats", effort.repeats), 6.5),
+        Step("ablate", ablate, 6.5, ("scene",)),
+        Step("scaling", ("scaling", "--steps", scaling_steps, "--repeats", effort.repeats), 9),
         long_clip,
-        Step("groups", (*groups, "--test-views", "12"), 2.5, ("scene-long",)),
+        Step("groups", (*groups, "--test-views", "12"), 1, ("scene-long",)),
         Step("step", ("step", DEFAULT, "--preset", effort.preset, "--repeats", effort.repeats), 3, ("scene",)),
         *_of_file("", f"{main}.kpc", "encode", effort.frames, effort.repeats),
-        Step("codec", ("codec", f"{coded}.kpck", "--dataset", DEFAULT), 4, ("scene", "encode-draft")),
-        Step("stability", ("stability",), 1),
+        Step("codec", ("codec", f"{coded}.kpck", "--dataset", DEFAULT), 8, ("scene", "encode-draft")),
+        Step("stability", ("stability",), 0.5),
         *_of_truth("", DEFAULT, f"{main}.kpc", ("scene", "encode"), effort.repeats),
     ]
     return [replace(step, minutes=round(step.minutes * effort.minutes, 2)) for step in steps]
@@ -208,12 +210,12 @@ def _of_file(end: str, file: str, encode: str, frames: tuple[int, int], repeats:
             minutes,
             (encode,),
         )
-        for size, minutes in (("320x240", 2), ("640x480", 4.5))
+        for size, minutes in (("320x240", 1.5), ("640x480", 4))
     ]
     steady = ("steady", file, "--frames", str(frames[1]))
     return [
         *player,
-        Step(f"stream{end}", ("stream", file, *timed), 1, (encode,)),
+        Step(f"stream{end}", ("stream", file, *timed), 0.5, (encode,)),
         Step(f"window{end}", ("window", file, "--seconds", "10", *timed), 1, (encode,), missing=_no_display),
         Step(f"steady{end}", steady, 1, (encode,), missing=_no_display),
         Step(f"web{end}", ("web", file, "--size", "320x240", "640x480"), 1.5, (encode,), missing=_no_browser),
