@@ -5,8 +5,10 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 from types import ModuleType
 
+import numba
 import numpy as np
 import pytest
 
@@ -113,7 +115,10 @@ def test_only_what_is_not_cached_is_compiled_elsewhere(monkeypatch: pytest.Monke
     assert done.is_done and called == (["warm up"] if is_cached else ["warm up", "compile", "warm up"])
 
 
-def test_threads_do_not_compile_where_only_cached_kernels_may_be_used() -> None:
+def test_threads_do_not_compile_where_only_cached_kernels_may_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))  # where an earlier run has kept nothing
     kernel = compiled()(lambda number: number + 1)
     with only_cached():
         (error,) = in_thread(lambda: kernel(1))
