@@ -15,7 +15,7 @@ Symbols in shape comments
 Modules
     compilation  how kernels are compiled
     arguments    named tuples that kernels take
-    geometry     rays, occupancy cells, slopes of the motion grid
+    geometry     rays and occupancy cells
     vectors      weighted sums, products and exponentials of many numbers at a time
     texels       the texels of one scale's planes, and the nodes of the motion grid, around a point
     planes       sampling of all planes at a sample of a ray, and its transpose

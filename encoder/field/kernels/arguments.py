@@ -69,7 +69,7 @@ class RayBuffers(NamedTuple):
 
     values: np.ndarray  # (K, S * 6 * M) float32, what each plane holds at a sample
     features: np.ndarray  # (K, F) float32
-    points: np.ndarray  # (K, 8) float32: u displaced, time, u before displacement, time
+    points: np.ndarray  # (K, POINT) float32: u displaced, time, u before displacement, time
     s: np.ndarray  # (K,) float32
     log_densities: np.ndarray  # (K,) float32, clipped
     taus: np.ndarray  # (K,) float32, optical thickness

@@ -11,11 +11,10 @@ from kpc.encoder.field.kernels.marching import (
     march_ray,
     negligible_weight,
     new_ray_buffers,
-    set_decoder,
     shade_ray,
 )
-from kpc.encoder.field.kernels.planes import scatter_planes, undisplace_gradient
-from kpc.encoder.field.kernels.texels import displace_transpose
+from kpc.encoder.field.kernels.planes import scatter_planes
+from kpc.encoder.field.kernels.texels import add_displacement_slopes, displace_transpose
 from kpc.encoder.field.kernels.vectors import add_decoder_gradient, decode_transpose
 from kpc.encoder.field.occupancy_grid import OccupancyGrid
 
@@ -109,7 +108,8 @@ def backpropagate_ray(planes, volume, origin, direction, buffers, count, trans, 
         if gradients.wants_motion:
             displace_transpose(gradients.motion, buffers.points, k, buffers.g_point)
         if wants_ray:
-            undisplace_gradient(planes.motion, buffers, k)
+            if planes.motion.shape[0] > 0:
+                add_displacement_slopes(planes.motion, buffers.points, k, buffers.g_point)
             add_ray_gradient(
                 origin,
                 direction,
@@ -162,17 +162,7 @@ def backpropagate(planes, density, volume, rays, basis, targets, distortion, gra
         buffers = new_ray_buffers(planes, capacity)
         for i in range(worker, N, workers):
             b, background = (basis[0] if shared else basis[i]), rays.backgrounds[i]
-            set_decoder(buffers, density, b)
-            count, trans = march_ray(
-                planes,
-                density[-1],
-                volume,
-                rays.origins[i],
-                rays.directions[i],
-                rays.times[i],
-                rays.jitters[i],
-                buffers,
-            )
+            count, trans = march_ray(planes, density, b, volume, rays, i, buffers)
             red, green, blue = shade_ray(
                 buffers, count, trans * background[0], trans * background[1], trans * background[2]
             )

@@ -1,4 +1,4 @@
-"""Rays, occupancy cells, and displacement by the motion grid.
+"""Rays and occupancy cells.
 
 `uniform_distance` is that of `kpc.format.scene.space.Contraction`, or 0 where the scene is its box.
 """
@@ -87,54 +87,6 @@ def cell_index(grid, u, v, w):
     y = min(max(int(v * ny), 0), ny - 1)
     z = min(max(int(w * nz), 0), nz - 1)
     return z, y, x
-
-
-@inlined
-def texel_and_fraction(u, size):
-    """Return the texel below a corner-aligned coordinate u in [0, 1], and the fraction of the way to the next."""
-    position = u * np.float32(size - 1)
-    lower = min(max(int(position), 0), max(size - 2, 0))
-    return lower, min(max(position - np.float32(lower), np.float32(0.0)), np.float32(1.0))
-
-
-@inlined
-def motion_cell(motion, u, v, w, time):
-    """Return the lower corner of the motion grid's cell around a point, and the fractions, along t, z, y, x."""
-    rows, nz, ny, nx, _ = motion.shape
-    t, ft = texel_and_fraction(time, rows)
-    z, fz = texel_and_fraction(w, nz)
-    y, fy = texel_and_fraction(v, ny)
-    x, fx = texel_and_fraction(u, nx)
-    return t, z, y, x, ft, fz, fy, fx
-
-
-@inlined
-def motion_corner(i, ft, fz, fy, fx):
-    """Return the offsets along t, z, y, x of corner i (0 to 15) of a motion cell, and its weight."""
-    dt, dz, dy, dx = i >> 3, i >> 2 & 1, i >> 1 & 1, i & 1
-    one = np.float32(1.0)
-    weight = (ft if dt else one - ft) * (fz if dz else one - fz) * (fy if dy else one - fy) * (fx if dx else one - fx)
-    return dt, dz, dy, dx, weight
-
-
-@inlined
-def add_displacement_slopes(motion, u, v, w, time, g):
-    """Add to g (4,), the gradient of displaced u and of time, what the displacement at u and time contributes."""
-    if motion.shape[0] == 0:
-        return
-    rows, nz, ny, nx, _ = motion.shape
-    t, z, y, x, ft, fz, fy, fx = motion_cell(motion, u, v, w, time)
-    g0, g1, g2 = g[0], g[1], g[2]
-    one = np.float32(1.0)
-    for i in range(16):
-        dt, dz, dy, dx, _ = motion_corner(i, ft, fz, fy, fx)
-        offset = motion[t + dt, z + dz, y + dy, x + dx]
-        along = offset[0] * g0 + offset[1] * g1 + offset[2] * g2
-        wt, wz, wy, wx = ft if dt else one - ft, fz if dz else one - fz, fy if dy else one - fy, fx if dx else one - fx
-        g[0] += along * wt * wz * wy * np.float32((2 * dx - 1) * (nx - 1))
-        g[1] += along * wt * wz * wx * np.float32((2 * dy - 1) * (ny - 1))
-        g[2] += along * wt * wy * wx * np.float32((2 * dz - 1) * (nz - 1))
-        g[3] += along * wz * wy * wx * np.float32((2 * dt - 1) * (rows - 1))
 
 
 @inlined

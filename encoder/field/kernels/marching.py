@@ -14,6 +14,7 @@ from kpc.encoder.field.kernels.geometry import (
     ray_span,
 )
 from kpc.encoder.field.kernels.planes import place_sample, sample_displaced
+from kpc.encoder.field.kernels.texels import POINT
 from kpc.encoder.field.kernels.vectors import WIDE, absorb, decode, dot, sigmoids
 from kpc.format.container.scene_layout import SAMPLE_LIMIT
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION
@@ -41,7 +42,7 @@ def new_ray_buffers(planes, capacity):
     return RayBuffers(
         np.empty((capacity, S * 6 * M), np.float32),
         np.empty((capacity, S * M), np.float32),
-        np.empty((capacity, 8), np.float32),
+        np.empty((capacity, POINT), np.float32),
         np.empty(capacity, np.float32),
         np.empty(capacity, np.float32),
         np.empty(capacity, np.float32),
@@ -102,15 +103,21 @@ def find_samples(volume, occupied, span, origin, direction, time, jitter, buffer
 
 
 @bare
-def march_ray(planes, bias, volume, origin, direction, time, jitter, buffers):
-    """March a ray until it leaves the volume or its transmittance falls below TERMINATION; fill the buffers.
+def march_ray(planes, density, basis, volume, rays, i, buffers):
+    """March ray i until it leaves the volume or its transmittance falls below TERMINATION; fill the buffers.
 
-    It follows `set_decoder`; `bias` is that of the log density. Samples are taken in blocks, each in several passes:
-    one sample after the other, the processor would mostly wait for results.
+    Samples are taken in blocks, each in several passes: one sample after the other, the processor would mostly wait
+    for results.
+
+    Args:
+        planes, density, volume, rays: as of `render`.
+        basis: (3, F) float32, the colour basis of the ray.
 
     Returns:
         The number of occupied samples, and the transmittance behind them.
     """
+    set_decoder(buffers, density, basis)
+    origin, direction, time, jitter = rays.origins[i], rays.directions[i], rays.times[i], rays.jitters[i]
     span = ray_span(origin, direction, volume.aabb, volume.uniform_distance)
     slots = volume.occupancy.shape[0]
     occupied = volume.occupancy[min(int(time * slots), slots - 1)]
@@ -118,11 +125,11 @@ def march_ray(planes, bias, volume, origin, direction, time, jitter, buffers):
     while True:
         found, k = find_samples(volume, occupied, span, origin, direction, time, jitter, buffers, count, k)
         end = count + found
-        for i in range(count, end):
-            sample_displaced(planes, buffers, i, buffers.features, i)
-        for i in range(count, end):
-            decode(buffers.decoder, buffers.features, i, buffers.features.shape[1], buffers.decoded)
-            buffers.log_densities[i] = min(max(buffers.decoded[i, 0] + bias, -LIMIT), LIMIT)
+        for n in range(count, end):
+            sample_displaced(planes, buffers, n, buffers.features, n)
+        for n in range(count, end):
+            decode(buffers.decoder, buffers.features, n, buffers.features.shape[1], buffers.decoded)
+            buffers.log_densities[n] = min(max(buffers.decoded[n, 0] + density[-1], -LIMIT), LIMIT)
         absorb(buffers.log_densities, buffers.taus, buffers.weights, count)
         while count < end:
             alpha = buffers.weights[count]
@@ -184,17 +191,7 @@ def render(planes, density, volume, rays, basis, capacity, workers):
     for worker in prange(workers):
         buffers = new_ray_buffers(planes, capacity)
         for i in range(worker, N, workers):
-            set_decoder(buffers, density, basis[i])
-            count, trans = march_ray(
-                planes,
-                density[-1],
-                volume,
-                rays.origins[i],
-                rays.directions[i],
-                rays.times[i],
-                rays.jitters[i],
-                buffers,
-            )
+            count, trans = march_ray(planes, density, basis[i], volume, rays, i, buffers)
             depth = np.float32(0.0)
             rgb = shade_ray(buffers, count, np.float32(0.0), np.float32(0.0), np.float32(0.0))
             for c in range(3):

@@ -3,8 +3,7 @@
 import numpy as np
 
 from kpc.encoder.field.kernels.compilation import inlined
-from kpc.encoder.field.kernels.geometry import add_displacement_slopes
-from kpc.encoder.field.kernels.texels import add_slopes, displace, sample_scale, scatter_scale
+from kpc.encoder.field.kernels.texels import POINT, add_slopes, displace, sample_scale, scatter_scale
 
 
 @inlined
@@ -15,7 +14,7 @@ def sample_planes(planes, buffers, k, features, row):
     holds there.
     """
     grid, M, scales = (planes.theta, planes.places, planes.intervals), planes.channels, planes.places.shape[0]
-    point = buffers.points, 8 * k
+    point = buffers.points, POINT * k
     for s in range(scales):
         values = buffers.values, (k * scales + s) * 6 * M
         products = features, (row * scales + s) * M
@@ -50,7 +49,7 @@ def scatter_planes(planes, g_theta, g_features, row, buffers, k, wants_point):
     grid = planes.theta, planes.places, planes.intervals
     g_grid, M, scales = (g_theta, planes.places, planes.intervals), planes.channels, planes.places.shape[0]
     points, g_point = buffers.points, buffers.g_point
-    point = points, 8 * k
+    point = points, POINT * k
     if wants_point:
         g_point[:] = np.float32(0.0)
     for s in range(scales):
@@ -68,10 +67,3 @@ def scatter_planes(planes, g_theta, g_features, row, buffers, k, wants_point):
         for axis in range(4):
             if points[k, axis] < np.float32(0.0) or points[k, axis] > np.float32(1.0):  # clamped
                 g_point[axis] = np.float32(0.0)
-
-
-@inlined
-def undisplace_gradient(motion, buffers, k):
-    """Turn the gradient with respect to displaced u and time of sample k into that with respect to u and time."""
-    point = buffers.points[k]
-    add_displacement_slopes(motion, point[4], point[5], point[6], point[3], buffers.g_point)

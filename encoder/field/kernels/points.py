@@ -9,9 +9,8 @@ from kpc.encoder.field.kernels.planes import (
     place_sample,
     sample_displaced,
     scatter_planes,
-    undisplace_gradient,
 )
-from kpc.encoder.field.kernels.texels import displace_transpose
+from kpc.encoder.field.kernels.texels import add_displacement_slopes, displace_transpose
 
 
 @parallel
@@ -68,6 +67,7 @@ def scatter_features(planes, g_theta, g_motion, g_points, points, times, g):
             if wants_motion:
                 displace_transpose(g_motion[worker], buffers.points, 0, buffers.g_point)
             if wants_points:
-                undisplace_gradient(planes.motion, buffers, 0)
+                if planes.motion.shape[0] > 0:
+                    add_displacement_slopes(planes.motion, buffers.points, 0, buffers.g_point)
                 for axis in range(4):  # an array assigned to a row would have its message about shapes compiled
                     g_points[i, axis] = buffers.g_point[axis]

@@ -38,6 +38,11 @@ AXES = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
 # Columns of each half of `PlaneSet.places`.
 PLACES = 8
 
+# Columns of `RayBuffers.points`, and where the point before displacement begins in a row.
+POINT, UNDISPLACED = 8, 4
+
+_ONE = ir.Constant(FLOAT, 1.0)
+
 
 def _texel_and_share(builder: Any, point: Any, interval: Any) -> tuple[Any, Any]:
     """Return, for four coordinates in [0, 1], the texel below and the share of the way to the next.
@@ -118,9 +123,10 @@ class _Scale:
         return gradients[::-1]
 
 
-def _placed(kind: Any) -> Any:
-    """Return the type of an array and a place in it."""
-    return types.Tuple((kind[0], types.int64))
+def _signature(grid: Any, point: Any, planes: Any, values: Any, features: Any, *more: Any) -> Any:
+    """Return the types of what `_Scale` unpacks, given those of the arguments, and of `more` after it."""
+    point, values, features = (types.Tuple((place[0], types.int64)) for place in (point, values, features))
+    return types.void(grid, types.int64, point, types.int64, planes, values, features, *more)
 
 
 def _place(context: Any, builder: Any, kind: Any, value: Any) -> Any:
@@ -166,8 +172,7 @@ def sample_scale(
         for_each_vector(builder, at.channels, WIDE, emit)
         return context.get_dummy_value()
 
-    whole = types.int64
-    return types.void(grid, whole, _placed(point), whole, planes, _placed(values), _placed(features)), generate
+    return _signature(grid, point, planes, values, features), generate
 
 
 @intrinsic(prefer_literal=True)
@@ -199,8 +204,7 @@ def scatter_scale(
         for_each_vector(builder, at.channels, WIDE, emit)
         return context.get_dummy_value()
 
-    whole = types.int64
-    return types.void(grid, whole, _placed(point), whole, planes, _placed(values), _placed(g_features)), generate
+    return _signature(grid, point, planes, values, g_features), generate
 
 
 @intrinsic(prefer_literal=True)
@@ -235,36 +239,45 @@ def add_slopes(
         for_each_vector(builder, at.channels, WIDE, emit)
         return context.get_dummy_value()
 
-    whole = types.int64
-    places = _placed(point), whole, planes, _placed(values), _placed(g_features)
-    return types.void(grid, whole, *places, g_point), generate
+    return _signature(grid, point, planes, values, g_features, g_point), generate
 
 
-def _motion_corners(context: Any, builder: Any, kind: Any, grid: Any, points: Any, at: Any) -> list[tuple[Any, Any]]:
-    """Return the 16 nodes of a motion grid around a point, whose coordinates begin at `at`: pointers and weights."""
-    grid = context.make_array(kind)(context, builder, grid)
-    sizes = cgutils.unpack_tuple(builder, grid.shape)[3::-1]  # along x, y, z, t
-    interval = constant(0.0, 4)
-    for axis, size in enumerate(sizes):
-        number = builder.sitofp(builder.sub(size, INDEX(1)), FLOAT)
-        interval = builder.insert_element(interval, number, LANE(axis))
-    texel, share = _texel_and_share(builder, load(builder, points, at, 4), interval)
-    first, stride, strides = INDEX(0), INDEX(3), []
-    for axis, size in enumerate(sizes):
-        lower = builder.sext(builder.extract_element(texel, LANE(axis)), INDEX)
-        first = builder.add(first, builder.mul(lower, stride))
-        strides.append(stride)
-        stride = builder.mul(stride, size)
-    nodes = [(first, ir.Constant(FLOAT, 1.0))]
-    for axis in reversed(range(4)):
-        on = builder.extract_element(share, LANE(axis))
-        back = builder.fsub(ir.Constant(FLOAT, 1.0), on)
-        nodes = [
-            (builder.add(node, strides[axis]) if further else node, builder.fmul(weight, on if further else back))
-            for node, weight in nodes
-            for further in (False, True)
-        ]
-    return [(builder.gep(grid.data, [node]), weight) for node, weight in nodes]
+class _MotionCell:
+    """The nodes of a motion grid around a row of `RayBuffers.points`, before displacement.
+
+    Attributes:
+        nodes: pointers to the 16 nodes, and of each its factors along x, y, z, t, whose product is its weight, and
+            whether it is the further one along each.
+        intervals: four float32, between nodes along each axis.
+    """
+
+    def __init__(self, builder: Any, grid: Any, points: Any, row: Any) -> None:
+        self.builder = builder
+        sizes = cgutils.unpack_tuple(builder, grid.shape)[3::-1]  # along x, y, z, t
+        self.intervals = [builder.sitofp(builder.sub(size, INDEX(1)), FLOAT) for size in sizes]
+        interval = constant(0.0, 4)
+        for axis, number in enumerate(self.intervals):
+            interval = builder.insert_element(interval, number, LANE(axis))
+        at = builder.add(builder.mul(row, INDEX(POINT)), INDEX(UNDISPLACED))
+        texel, share = _texel_and_share(builder, load(builder, points, at, 4), interval)
+        stride = INDEX(3)
+        nodes: list[tuple[Any, tuple[Any, ...], tuple[bool, ...]]] = [(INDEX(0), (), ())]
+        for axis, size in enumerate(sizes):
+            lower = builder.mul(builder.sext(builder.extract_element(texel, LANE(axis)), INDEX), stride)
+            on = builder.extract_element(share, LANE(axis))
+            ways = (lower, builder.fsub(_ONE, on), False), (builder.add(lower, stride), on, True)
+            nodes = [
+                (builder.add(node, step), (*factors, factor), (*further, is_further))
+                for node, factors, further in nodes
+                for step, factor, is_further in ways
+            ]
+            stride = builder.mul(stride, size)
+        self.nodes = [(builder.gep(grid.data, [node]), *rest) for node, *rest in nodes]
+
+    def weighted(self) -> Iterator[tuple[Any, Any]]:
+        """Yield a pointer to each node, and its weight as a vector of three."""
+        for node, factors, _ in self.nodes:
+            yield node, spread(self.builder, product(self.builder, *factors), 3)
 
 
 @intrinsic
@@ -272,17 +285,16 @@ def displace(_: Any, motion: Any, points: Any, k: Any) -> Any:
     """Set points[k, :3] to points[k, 4:7] + D: `kpc.format.scene.motion.displace` of points[k, 4:8], u and time.
 
     Args:
-        motion: (T, Nz, Ny, Nx, 3) float32, at least two along each axis. points: (n, 8) float32. k: int64.
+        motion: (T, Nz, Ny, Nx, 3) float32, at least two along each axis. points: (n, POINT) float32. k: int64.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        points = array_of(context, builder, signature, arguments, 1).data
-        at = builder.mul(arguments[2], INDEX(8))
-        undisplaced = builder.add(at, INDEX(4))
-        terms = [load(builder, points, undisplaced, 3)]
-        for node, weight in _motion_corners(context, builder, signature.args[0], arguments[0], points, undisplaced):
-            terms.append(product(builder, spread(builder, weight, 3), load(builder, node, INDEX(0), 3)))
-        store(builder, added(builder, *terms), points, at)
+        motion, points = (array_of(context, builder, signature, arguments, n) for n in range(2))
+        at = builder.mul(arguments[2], INDEX(POINT))
+        terms = [load(builder, points.data, builder.add(at, INDEX(UNDISPLACED)), 3)]
+        for node, weight in _MotionCell(builder, motion, points.data, arguments[2]).weighted():
+            terms.append(product(builder, weight, load(builder, node, INDEX(0), 3)))
+        store(builder, added(builder, *terms), points.data, at)
         return context.get_dummy_value()
 
     return types.void(motion, points, types.int64), generate
@@ -293,12 +305,33 @@ def displace_transpose(_: Any, g_motion: Any, points: Any, k: Any, g: Any) -> An
     """Add the gradient of the motion grid, given g (3,) or longer, that of points[k, :3] of `displace`."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        points, g = (array_of(context, builder, signature, arguments, n).data for n in (1, 3))
-        gradient = load(builder, g, INDEX(0), 3)
-        at = builder.add(builder.mul(arguments[2], INDEX(8)), INDEX(4))
-        for node, weight in _motion_corners(context, builder, signature.args[0], arguments[0], points, at):
-            term = product(builder, spread(builder, weight, 3), gradient)
+        g_motion, points, g = (array_of(context, builder, signature, arguments, n) for n in (0, 1, 3))
+        gradient = load(builder, g.data, INDEX(0), 3)
+        for node, weight in _MotionCell(builder, g_motion, points.data, arguments[2]).weighted():
+            term = product(builder, weight, gradient)
             store(builder, added(builder, load(builder, node, INDEX(0), 3), term), node, INDEX(0))
         return context.get_dummy_value()
 
     return types.void(g_motion, points, types.int64, g), generate
+
+
+@intrinsic
+def add_displacement_slopes(_: Any, motion: Any, points: Any, k: Any, g: Any) -> Any:
+    """Add to g (4,), the gradient of points[k, :3] of `displace` and of time, what the displacement contributes."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        motion, points, g = (array_of(context, builder, signature, arguments, n) for n in (0, 1, 3))
+        cell = _MotionCell(builder, motion, points.data, arguments[2])
+        gradient, slopes = load(builder, g.data, INDEX(0), 3), [ir.Constant(FLOAT, 0.0)] * 4
+        for node, factors, further in cell.nodes:
+            parts = product(builder, load(builder, node, INDEX(0), 3), gradient)
+            along = added(builder, *(builder.extract_element(parts, LANE(n)) for n in range(3)))
+            for axis, is_further in enumerate(further):
+                slope = product(builder, along, *factors[:axis], *factors[axis + 1 :])
+                slopes[axis] = added(builder, slopes[axis], slope if is_further else builder.fneg(slope))
+        for axis, (slope, interval) in enumerate(zip(slopes, cell.intervals, strict=True)):
+            place = builder.gep(g.data, [INDEX(axis)])
+            builder.store(added(builder, builder.load(place), product(builder, slope, interval)), place)
+        return context.get_dummy_value()
+
+    return types.void(motion, points, types.int64, g), generate
