@@ -16,7 +16,7 @@ from typing import Any
 
 import fsspec
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client, Future, LocalCluster
 
 from kpc.format.common.errors import UsageError
 from kpc.tools.batch import engine, jobs, simulation, working
@@ -314,6 +314,29 @@ def test_a_worker_that_is_killed_is_replaced_and_its_task_goes_on(tmp_path: Path
     assert sorted(done) == ["key0", "key1", "key2"] and killed
     assert len(Store(str(tmp_path)).names("*/step*")) == 30
     assert 30 <= len(steps) <= 32  # at most the step of each task that the killed worker was in is done twice
+
+
+class Killer(Engine):
+    """Kills the worker of the first task that is done before its outcome is asked for."""
+
+    killed = 0
+
+    def _wait(self) -> list[Future]:
+        done = super()._wait()
+        if done and not self.killed:
+            self.killed = int(done[0].result().worker)
+            os.kill(self.killed, signal.SIGKILL)
+            while done[0].status == "finished":
+                time.sleep(0.01)
+        return done
+
+
+def test_an_outcome_that_is_lost_with_its_worker_is_waited_for_again(tmp_path: Path) -> None:
+    with engine.local_cluster(1, Resources()) as client:
+        made = Killer(lambda: client, Place(str(tmp_path)), in_steps)
+        made.add([task(0)])
+        assert [event.kind for event in made.events() if event.kind != "runs"] == ["waits", "done"]
+    assert len(list(tmp_path.glob("key?.*"))) == 10
 
 
 def test_a_scheduler_that_is_killed_is_one_line_and_another_goes_on(

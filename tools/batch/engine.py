@@ -212,6 +212,9 @@ class Engine:
             if task.key in latest:
                 yield Event(task, "runs", latest[task.key])
         for future in done:
+            if future.status in ("lost", "pending"):  # its worker was killed, and another does the task again
+                self._completed.add(future)
+                continue
             task = self._futures.pop(future)
             outcome = self._outcome_of(future, task)
             if not outcome.is_done and self._attempts[task.key] < ATTEMPTS:
@@ -234,7 +237,7 @@ class Engine:
         """Return the outcome of a future that has ended.
 
         Raises:
-            ClusterError: it was lost with the scheduler.
+            ClusterError: the scheduler, or its client, has given it up.
         """
         if future.status == "finished":
             found: Outcome = future.result()
