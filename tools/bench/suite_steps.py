@@ -98,7 +98,7 @@ HOUR = Effort(
 QUICK = Effort(
     scene=("--frames", "6", "--cameras", "4", "--size", "48x36", "--samples", "1"),
     long=("--frames", "24", "--cameras", "4", "--size", "48x36", "--samples", "1"),
-    group="1s",
+    group="0.5s",
     preset="draft",
     curves={"draft": "0.02,0.05"},
     encode=("--steps", "30", "--test-views", "2"),
@@ -152,7 +152,7 @@ def generated(effort: Effort) -> list[Step]:
         "--steps",
         group_steps,
         "--group",
-        "2.5s" if effort is HOUR else "0.5s",
+        effort.group,
     )
     steps = [
         scene,
