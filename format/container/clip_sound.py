@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from kpc.format.container.groups import Groups, Timeline
 from kpc.format.scene.sound import SAMPLE_RATE, Sound
 
+# A sample that no sound reaches; floats are exact up to there.
+LAST_SAMPLE = 2.0**53
+
 
 @dataclass(frozen=True)
 class SoundSpan:
@@ -28,8 +31,11 @@ class SoundSpan:
 
 
 def sample_at(frame: float, fps: float) -> int:
-    """Return the sample that is heard when a frame of a clip, counted from 0, is first shown."""
-    return math.floor(SAMPLE_RATE * frame / fps + 0.5)
+    """Return the sample that is heard when a frame of a clip, counted from 0, is first shown.
+
+    At a rate that is almost 0 this may be no finite number; LAST_SAMPLE, later than any sound, stands for it.
+    """
+    return math.floor(min(SAMPLE_RATE * frame / fps + 0.5, LAST_SAMPLE))
 
 
 def sound_spans(timeline: Timeline) -> tuple[SoundSpan, ...]:

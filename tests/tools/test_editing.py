@@ -13,7 +13,7 @@ from kpc.format.container import groups
 from kpc.format.container.container import Codec, Reader
 from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.scene.metadata import Metadata
-from kpc.format.scene.scene import TIME_PLANES
+from kpc.format.scene.scene import TIME_PLANES, Clip
 from kpc.player.cpu import reference
 from kpc.tools.cli import kpedit, kpjoin
 from kpc.tools.editing.cropping import cropped
@@ -120,6 +120,22 @@ def test_speed_and_frame_rate_change_the_clip_and_no_symbol(tmp_path):
     ]
     clip = read(tmp_path / "out.kpc").clip
     assert (clip.frame_count, clip.fps) == (21, 40.0)
+
+
+@pytest.mark.parametrize(
+    ("fps", "words", "message"),
+    [
+        (10.0, ["--speed", "101"], "--speed 101: the clip would have 1010 frames per second"),
+        (0.01, ["--speed", "0.01"], "--speed 0.01: the clip would have 0.0001"),
+        (10.0, ["--fps", "0.4"], "the clip lasts 1 s, which would be a single frame"),
+        (1e-6, ["--fps", "2"], "the clip lasts 1e+07 s, which would be more than 16,777,216 frames"),
+        (5e-324, ["--from", "0.5s"], "the clip has no end in seconds"),
+    ],
+)
+def test_no_edit_makes_a_clip_of_an_odd_rate_or_length(tmp_path, capsys, fps, words, message):
+    write(replace(quantised(), clip=Clip(11, fps)), tmp_path / "in.kpc")
+    assert kpedit.main([str(tmp_path / "in.kpc"), "-o", str(tmp_path / "out.kpc"), *words]) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "out.kpc").exists()
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -259,8 +275,8 @@ def test_groups_without_shared_frames_stay_without_a_gap_at_any_rate(fps, tmp_pa
     spans = groups.Groups(tmp_path / "six.kpc").timeline.spans
     assert [one.start for one in spans[1:]] == [one.last + 1 for one in spans[:-1]] and len(spans) == 6
     assert abs(spans[5].last - 65 * fps / 10) <= 1.5 + fps / 10  # each half as long as before, to half a frame
-    command = [str(tmp_path / "three.kpc"), "-o", str(tmp_path / "short.kpc"), "--fps", "0.01"]
-    assert kpedit.main(command) == 2 and "--fps 0.01: at this rate" in capsys.readouterr().err
+    command = [str(tmp_path / "three.kpc"), "-o", str(tmp_path / "short.kpc"), "--fps", "0.5"]
+    assert kpedit.main(command) == 2 and "--fps 0.5: at this rate" in capsys.readouterr().err
 
 
 def symbols_equal(one, other):

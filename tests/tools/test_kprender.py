@@ -157,8 +157,8 @@ def test_the_camera_path_of_nerfstudio(run, scene_file: Path, tmp_path: Path, fp
         np.testing.assert_array_equal(view.camera.camera_to_world, camera.camera_to_world)
         intrinsics = [view.camera.fl_x, view.camera.fl_y, view.camera.cx, view.camera.cy]
         assert intrinsics == pytest.approx([55, 55, 24, 18])
-    words = ["--size", "8x6", "--backend", "reference", "--fps", 3]
-    code, printed, _ = run(scene_file, "--path", file, *words, "-o", tmp_path / "path.mp4")
+    words = ["--size", "8x6", "--backend", "reference"]
+    code, printed, _ = run(scene_file, "--path", file, *words, "--fps", 3, "-o", tmp_path / "path.mp4")
     assert code == 0 and f"{round(3 * at_s[-1]) + 1} frames" in printed
     code, printed, _ = run(scene_file, "--cameras", file, *words, "-o", tmp_path / "views")
     assert code == 0 and len(list((tmp_path / "views").glob("*.png"))) == 3

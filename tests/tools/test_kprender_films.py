@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import kpc
-from kpc.format.common.errors import MediaError
+from kpc.format.common.errors import MediaError, UsageError
 from kpc.format.common.images import read_image
+from kpc.format.container.clip_sound import LAST_SAMPLE, sample_at
 from kpc.format.scene.scene import Clip
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
@@ -86,12 +87,23 @@ def test_films_last_as_long_as_the_clip(
         (Clip(3, 500.0), [], 240.0, "the clip's 500 fps are beyond 0.001 to 240; 240 fps are used"),
         (Clip(3, 500.0), ["--fps", "100"], 100.0, None),
         (Clip(1, 0.4), [], 1.0, None),
+        (Clip(11, 1e300), [], 240.0, "the clip's 1e+300 fps are beyond 0.001 to 240; 240 fps are used"),
     ],
 )
 def test_a_clip_keeps_its_rate_or_a_line_says_so(clip: Clip, words: list[str], rate: float, note: str | None) -> None:
     options = parser().parse_args(["x.kpc", "-o", "x", *words])
     scene = replace(tiny_scene(4), clip=clip)
-    assert shots_of(scene, clip, options, is_film=True).fps == rate and rate_note(clip, options) == note
+    shots = shots_of(scene, clip, options, is_film=True)
+    assert shots.fps == rate and rate_note(clip, options) == note
+    assert len(shots) >= 1 and 0 <= shots.time(shots.numbers[-1]) <= 1
+
+
+def test_a_clip_that_hardly_moves_has_too_many_pictures() -> None:
+    clip = Clip(1 << 24, 5e-324)  # the slowest that a file may have
+    options = parser().parse_args(["x.kpc", "-o", "x"])
+    with pytest.raises(UsageError, match="more than 100,000 pictures"):
+        shots_of(replace(tiny_scene(4), clip=clip), clip, options, is_film=False)
+    assert sample_at(clip.frame_count, clip.fps) == LAST_SAMPLE
 
 
 @pytest.mark.parametrize(
@@ -107,6 +119,9 @@ def test_a_clip_keeps_its_rate_or_a_line_says_so(clip: Clip, words: list[str], r
         (["--diagnose", "both"], "'both' is neither static nor dynamic"),
         (["--time", 0.5, "--frames", "0-3"], "--time stops the clip"),
         (["--time", 0.5, "--from", 0.1, "--to", 0.3], "--time stops the clip"),
+        (["--time", 0.5, "--fps", 60], "leave out --time or --fps"),
+        (["--time", 0.5, "--step", 3], "leave out --time or --step"),
+        (["--orbit", 4, "--fps", 60], "--fps: --orbit says how many pictures"),
         (["-o", ""], "the name is empty"),
         (["-o", "x.mp4", "--depth", "--matte"], "--depth: a film shows depth or --matte"),
         (["--step", 0], "--step"),
@@ -122,7 +137,8 @@ def test_a_clip_keeps_its_rate_or_a_line_says_so(clip: Clip, words: list[str], r
         (["-o", "x.exr", "--matte", "--time", 0], "channel A of --dynamic-only"),
         (["-o", "x.mp4", "--background", "transparent"], "films with alpha are prores (.mov, .mkv)"),
         (["-o", "x.mp4", "--codec", "vp9"], "it holds h264, hevc, av1"),
-        (["-o", "x.mp4", "--resume"], "cannot be resumed"),
+        (["-o", "x.mp4", "--resume"], "a film cannot be resumed"),
+        (["-o", "x.png", "--time", 0, "--resume"], "a single picture cannot be resumed"),
         (["-o", "x.png", "--size", "9000x10", "--samples", 2, "--time", 0], "more than 16384"),
     ],
 )

@@ -39,6 +39,7 @@ from kpc.format.scene.view_limits import find_view, view_members
 from kpc.player.cpu import reference
 from kpc.tools.editing.clips import Edits, edit
 from kpc.tools.editing.placing import Placement, axis_turn
+from kpc.tools.editing.timing import MAX_FPS, MIN_FPS
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -125,7 +126,7 @@ def _add_edits(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--move", type=_vector, metavar="X,Y,Z", help="move, after scaling and turning")
     parser.add_argument("--speed", type=_speed, metavar="F", help="play F times as fast: same frames, no sound")
     parser.add_argument(
-        "--fps", type=cli.frame_rate(0.001, 1000.0), metavar="F", help="frames per second, at the same length"
+        "--fps", type=cli.frame_rate(MIN_FPS, MAX_FPS), metavar="F", help="frames per second, at the same length"
     )
 
 

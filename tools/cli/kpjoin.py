@@ -18,6 +18,7 @@ from kpc.format.common.errors import UsageError
 from kpc.format.container import groups
 from kpc.format.scene.metadata import camera_document, differences
 from kpc.tools.editing.clips import Edits, edit
+from kpc.tools.editing.timing import MAX_FPS, MIN_FPS
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -38,7 +39,7 @@ def _command(argv: list[str]) -> None:
     )
     parser.add_argument(
         "--fps",
-        type=cli.frame_rate(0.001, 1000.0),
+        type=cli.frame_rate(MIN_FPS, MAX_FPS),
         metavar="F",
         help="frames per second of the clip; files of other rates keep their length, to half a frame",
     )

@@ -84,15 +84,17 @@ def _command(argv: list[str]) -> None:
 
 def _film_format(output: Output, options: argparse.Namespace) -> FilmFormat | None:
     """Return how to encode a film, None for pictures; refuse options that the output does not have."""
+    if options.resume and not output.is_folder:
+        what = "a film" if output.is_film else "a single picture"
+        raise UsageError(
+            f"--resume: {what} cannot be resumed; leave it out, or render pictures into a folder instead of "
+            f"{options.output}"
+        )
     if not output.is_film:
         asked = [name for name in ("codec", "crf", "bits") if getattr(options, name) is not None]
         if asked:
             raise UsageError(f"--{asked[0]} is for films; {options.output} is none")
         return None
-    if options.resume:
-        raise UsageError(
-            f"--resume: a film cannot be resumed; render pictures into a folder instead of {options.output}"
-        )
     has_alpha = isinstance(options.background, str)
     try:
         return FilmFormat.of(output.suffix, options.codec, crf=options.crf, bits=options.bits, alpha=has_alpha)

@@ -16,7 +16,7 @@ from kpc.format.scene.scene import Clip
 from kpc.tools.editing.cropping import cropped
 from kpc.tools.editing.files import edited
 from kpc.tools.editing.placing import Placement, placed, placed_metadata
-from kpc.tools.editing.timing import at_rate, at_speed, check_part, spans_at_rate, trimmed
+from kpc.tools.editing.timing import at_rate, at_speed, check_part, check_rate, check_speed, spans_at_rate, trimmed
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,8 @@ def edit(source: Path, output: Path, edits: Edits, metadata: Metadata) -> tuple[
         UsageError, FormatError: it cannot be done.
     """
     clip = groups.Groups(source)
+    if edits.speed is not None and edits.fps is None:
+        check_speed(clip.clip, edits.speed)
     if edits.placement is not None:
         metadata = placed_metadata(metadata, edits.placement)
     if not clip.is_single:
@@ -97,6 +99,7 @@ def _edit_groups(
     fps *= edits.speed or 1.0
     spans = spans[numbers[0] : numbers[-1] + 1]
     if edits.fps is not None:
+        check_rate(Clip(spans[-1].last - spans[0].start + 1, fps), edits.fps)
         spans = spans_at_rate(spans, fps, edits.fps)
         try:
             groups.check_spans(spans, clip.name)

@@ -15,11 +15,14 @@ from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common.cli import TIME_SLACK_S
 from kpc.format.common.errors import UsageError
 from kpc.format.container.groups import Span
-from kpc.format.container.scene_layout import AXIS_LIMIT
+from kpc.format.container.scene_layout import AXIS_LIMIT, FRAME_LIMIT
 from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.scene.scene import TIME_PLANES, Clip
 from kpc.format.scene.sound import SAMPLE_RATE
 from kpc.tools.editing.unread import without_unread
+
+# Limits of the frames per second that an edited clip may be given.
+MIN_FPS, MAX_FPS = 0.001, 1000.0
 
 
 def at_speed(scene: QuantisedScene, factor: float) -> QuantisedScene:
@@ -28,8 +31,37 @@ def at_speed(scene: QuantisedScene, factor: float) -> QuantisedScene:
 
 
 def at_rate(scene: QuantisedScene, fps: float) -> QuantisedScene:
-    """Return a clip of another frame rate that lasts as long, to half a frame."""
+    """Return a clip of another frame rate that lasts as long, to half a frame.
+
+    Raises:
+        UsageError: a moving scene would have a single frame, or a clip more than a file may have.
+    """
+    check_rate(scene.clip, fps)
     return replace(scene, clip=Clip(1 + round(scene.clip.duration_s * fps), fps))
+
+
+def check_speed(clip: Clip, factor: float) -> None:
+    """Raise a UsageError if a clip that runs `factor` times as fast has a frame rate outside of the limits."""
+    if not MIN_FPS <= clip.fps * factor <= MAX_FPS:
+        raise UsageError(
+            f"--speed {factor:g}: the clip would have {clip.fps * factor:g} frames per second, which may be from "
+            f"{MIN_FPS:g} to {MAX_FPS:g}; choose another speed"
+        )
+
+
+def check_rate(clip: Clip, fps: float) -> None:
+    """Raise a UsageError if a clip of several frames would have too few or too many at another rate."""
+    if clip.frame_count == 1:
+        return
+    if clip.duration_s * fps > FRAME_LIMIT - 1:
+        raise UsageError(
+            f"--fps {fps:g}: the clip lasts {clip.duration_s:g} s, which would be more than {FRAME_LIMIT:,} frames; "
+            "choose a lower rate"
+        )
+    if round(clip.duration_s * fps) < 1:
+        raise UsageError(
+            f"--fps {fps:g}: the clip lasts {clip.duration_s:g} s, which would be a single frame; choose a higher rate"
+        )
 
 
 def spans_at_rate(spans: Sequence[Span], before: float, after: float) -> tuple[Span, ...]:
@@ -48,6 +80,8 @@ def spans_at_rate(spans: Sequence[Span], before: float, after: float) -> tuple[S
 
 def check_part(clip: Clip, start_s: float, end_s: float) -> None:
     """Raise a UsageError if a clip does not have a part from one time to another, seconds; it may end at infinity."""
+    if not math.isfinite(clip.total_s):
+        raise UsageError(f"--from, --to: at {clip.fps:g} frames per second the clip has no end in seconds")
     if start_s >= clip.total_s:
         raise UsageError(f"--from {start_s:g}s: the clip lasts {clip.total_s:.2f} s")
     if clip.total_s + TIME_SLACK_S < end_s < math.inf:
@@ -84,7 +118,7 @@ def trimmed(scene: QuantisedScene, start_s: float, end_s: float) -> tuple[Quanti
         raise UsageError("--from, --to: the scene is static; there is nothing to cut")
     check_part(scene.clip, start_s, end_s)
     first = min(parts - 1, math.floor(start_s / duration_s * parts + 1e-9))
-    last = min(parts, math.ceil(min(end_s, duration_s) / duration_s * parts - 1e-9))
+    last = min(parts, max(first + 1, math.ceil(min(end_s, duration_s) / duration_s * parts - 1e-9)))
     if (first, last) == (0, parts):
         if parts == 1 and (start_s > 0 or end_s < duration_s):
             raise UsageError("--from, --to: the planes of the clip have no rows in common at which it can be cut")

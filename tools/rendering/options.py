@@ -190,7 +190,7 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--resume",
         action="store_true",
-        help="skip pictures that are in the folder already and whole, of the same options",
+        help="skip pictures that are in the folder already and whole, of the same options; not for a single file",
     )
     group.add_argument(
         "--codec",

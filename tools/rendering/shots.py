@@ -97,11 +97,13 @@ def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: boo
         DatasetError: a camera file cannot be used.
         UsageError: there are no such frames, or too many.
     """
+    is_still = options.time is not None and options.cameras is options.path is options.orbit is None
+    _check_rate_and_step(options, is_still, is_film)
     timeline = replace(_timeline(scene, clip, options, is_film), is_stopped=options.time is not None)
     if timeline.count > MAX_PICTURES:
-        raise UsageError(f"{timeline.count} pictures are more than {MAX_PICTURES}; choose a lower --fps")
+        raise UsageError(f"the clip has more than {MAX_PICTURES:,} pictures; choose a lower --fps, or --time")
     has_span = options.frames not in (None, (0, 0)) or options.start_s is not None or options.end_s is not None
-    if timeline.is_stopped and has_span and options.cameras is options.path is options.orbit is None:
+    if is_still and has_span:
         raise UsageError(
             "--time stops the clip, so that there is one frame only; leave out --time, or --frames, --from and --to"
         )
@@ -123,6 +125,31 @@ def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: boo
         if first > last:
             raise UsageError(f"--from {start_s:g}s --to {end_s:g}s: no frame lies between them; swap or widen them")
     return Shots(timeline, range(first, last + 1, options.step), fps / options.step, options.shutter)
+
+
+def _check_rate_and_step(options: argparse.Namespace, is_still: bool, is_film: bool) -> None:
+    """Refuse --fps and --step where they change nothing.
+
+    The rate counts for films, an open shutter, paths, seconds, and the frames of a clip that plays.
+
+    Args:
+        options: of the command line.
+        is_still: whether there is one frame only, of a fixed camera at --time.
+        is_film: whether a film is rendered.
+
+    Raises:
+        UsageError: one of them changes nothing.
+    """
+    if is_still and options.step > 1:
+        raise UsageError("--time stops the clip, so that there is one frame only; leave out --time or --step")
+    has_seconds = options.start_s is not None or options.end_s is not None
+    if options.fps is None or is_film or options.shutter > 0 or options.path is not None or has_seconds:
+        return
+    if is_still:
+        raise UsageError("--time stops the clip, so that there is one frame only; leave out --time or --fps")
+    if options.cameras is not None or options.orbit is not None:
+        name = "--orbit" if options.cameras is None else "--cameras"
+        raise UsageError(f"--fps: {name} says how many pictures there are; leave --fps out, or render a film")
 
 
 def rate_of(clip: Clip) -> float:
@@ -179,7 +206,9 @@ def _timeline(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bo
     camera = fitted(_camera(scene, options))
     if fixed_time is not None:
         return Timeline(1, fps, lambda frame: (camera, _clamped(fixed_time + frame * clip_frames / last_frame)))
-    count = math.ceil(clip.frame_count / clip_frames - SLACK) if clip.frame_count > 1 else 1
+    # A clip that is shorter than a frame has one, and one that hardly moves more than can be counted.
+    frames = min(clip.frame_count * fps / clip.fps, 2.0 * MAX_PICTURES) if clip.frame_count > 1 else 1.0
+    count = max(1, math.ceil(frames - SLACK))
     return Timeline(count, fps, lambda frame: (camera, _clamped(frame * clip_frames / last_frame)))
 
 
