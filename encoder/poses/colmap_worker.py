@@ -12,7 +12,7 @@ too; all matches of two views then count together.
 import json
 import sys
 from collections.abc import Iterator
-from itertools import combinations
+from itertools import combinations, islice
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +31,16 @@ MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 # for the same result.
 TOLERANCE = 1e-6
 
+# Camera models are compared on about so many observations of points.
+COMPARED = 100_000
+
 # The camera model while views are placed.
 FIRST_MODEL = "SIMPLE_RADIAL"
 
 # Views that a model has at least.
 LEAST_VIEWS = 3
+# Matches of two views that agree with one geometry count if there are so many, as COLMAP has it.
+LEAST_MATCHES = 15
 # Matches agree with a geometry to within this share of the larger side of pictures, or a pixel. COLMAP's own 4 pixels
 # are so much for large pictures; in small ones, all that a plane shows agrees with wrong geometries, too.
 VERIFIED = 0.0025
@@ -240,7 +245,7 @@ def _tolerance(largest: int) -> float:
 
 
 def _reconstruct(folder: Path, database: Path, job: dict[str, Any]) -> tuple[pycolmap.Reconstruction | None, list[int]]:
-    """Place the views all at once, and one after another where that leaves some out.
+    """Place the views all at once, and one after another where that leaves out some that match others.
 
     Focal lengths are estimated from pairs of views first: with COLMAP's assumption alone, rigs of few views end in a
     wrong one.
@@ -251,12 +256,12 @@ def _reconstruct(folder: Path, database: Path, job: dict[str, Any]) -> tuple[pyc
     output = folder / "models"
     output.mkdir(exist_ok=True)
     pycolmap.calibrate_view_graph(database)
-    total, models = len(job["views"]), []
+    total, models = _matching_views(database), []
     for number, mapper in enumerate((_map_globally, _map_incrementally)):
         _say("placing cameras", number, 2)
         models += [model for model in mapper(folder, database, output, job) if model.num_reg_images() >= LEAST_VIEWS]
         best = max(models, key=lambda model: (model.num_reg_images(), -_mean_error(model)), default=None)
-        if best is not None and best.num_reg_images() == total and _mean_error(best) < GOOD_ERROR:
+        if best is not None and best.num_reg_images() >= total and _mean_error(best) < GOOD_ERROR:
             break
     placed = set() if best is None else set(best.reg_image_ids())
     others = [set(model.reg_image_ids()) - placed for model in models]
@@ -264,8 +269,21 @@ def _reconstruct(folder: Path, database: Path, job: dict[str, Any]) -> tuple[pyc
     return best, sorted(number - 1 for number in apart)
 
 
+def _matching_views(file: Path) -> int:
+    """Return how many views have matches with another that agree with one geometry: only these can be placed."""
+    database = pycolmap.Database.open(file)
+    agreeing = zip(*database.read_two_view_geometry_num_inliers(), strict=True)
+    found = {
+        view for pair, count in agreeing if count >= LEAST_MATCHES for view in pycolmap.pair_id_to_image_pair(pair)
+    }
+    database.close()
+    return len(found)
+
+
 def _map_globally(folder: Path, database: Path, output: Path, job: dict[str, Any]) -> list[pycolmap.Reconstruction]:
     options = pycolmap.GlobalPipelineOptions(num_threads=job["threads"], random_seed=job["seed"])
+    if job["tracks"] is not None:
+        options.mapper.track_required_tracks_per_view = job["tracks"]
     return list(pycolmap.global_mapping(database, folder, output, options).values())
 
 
@@ -283,21 +301,35 @@ def _mean_error(model: pycolmap.Reconstruction) -> float:
 
 
 def _with_best_cameras(model: pycolmap.Reconstruction, is_rig: bool) -> pycolmap.Reconstruction:
-    """Return the model adjusted with the cameras that its points speak for: how many parameters, shared or not."""
-    best, least = model, np.inf
-    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    options.ceres.solver_options.function_tolerance = TOLERANCE
+    """Return the model adjusted with the cameras that its points speak for: how many parameters, shared or not.
+
+    If there are many more than COMPARED observations, some of the points choose the cameras, and then all count.
+    """
+    best, chosen, least = model, (FIRST_MODEL, True), np.inf
+    every = max(1, round(model.compute_num_observations() / COMPARED))
     _say("adjusting lenses", 0, 1)
     for shared in (True, False) if is_rig else (True,):
         for name in MODELS:
-            tried = _with_cameras(model, name, shared)
-            pycolmap.bundle_adjustment(tried, options)
+            tried = _with_cameras(model, name, shared, every)
+            _adjust(tried)
             measure = _criterion(tried)
             if measure < least:
-                best, least = tried, measure
+                best, chosen, least = tried, (name, shared), measure
             elif name != MODELS[0] or not shared:
                 break  # more parameters do not help
-    return best
+    if every == 1 or not np.isfinite(least):
+        return best
+    whole = _with_cameras(model, *chosen)
+    for number, camera in best.cameras.items():
+        whole.cameras[number].params = camera.params
+    _adjust(whole)
+    return whole
+
+
+def _adjust(model: pycolmap.Reconstruction) -> None:
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.solver_options.function_tolerance = TOLERANCE
+    pycolmap.bundle_adjustment(model, options)
 
 
 def _criterion(model: pycolmap.Reconstruction) -> float:
@@ -310,8 +342,15 @@ def _criterion(model: pycolmap.Reconstruction) -> float:
     return float(count * np.log((errors**2).mean()) + EVIDENCE * parameters * np.log(count))
 
 
-def _with_cameras(model: pycolmap.Reconstruction, name: str, shared: bool) -> pycolmap.Reconstruction:
-    """Return a copy with other camera models, which begin with the focal length found and without distortion."""
+def _with_cameras(model: pycolmap.Reconstruction, name: str, shared: bool, every: int = 1) -> pycolmap.Reconstruction:
+    """Return a copy with other camera models, which begin with the focal length found and without distortion.
+
+    Args:
+        model: what is copied.
+        name: of the camera model.
+        shared: whether views that have one camera now keep it; else each gets its own.
+        every: the copy has one of so many points.
+    """
     copy = pycolmap.Reconstruction()
     cameras: set[int] = set()
     for number in model.reg_image_ids():
@@ -325,7 +364,7 @@ def _with_cameras(model: pycolmap.Reconstruction, name: str, shared: bool) -> py
         places = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
         copied = pycolmap.Image(name=image.name, keypoints=places, camera_id=key, image_id=number)
         copy.add_image_with_trivial_frame(copied, image.cam_from_world())
-    for point in model.points3D.values():
+    for point in islice(model.points3D.values(), 0, None, every):
         copy.add_point3D(point.xyz, point.track)
     return copy
 

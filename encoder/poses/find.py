@@ -27,6 +27,8 @@ from kpc.format.common.progress import progress
 ATTEMPTS = ((4096, 4), (8192, 10))
 # Features in each picture of a moving camera or a collection of more than MANY.
 FEATURES_OF_MANY = 2048
+# Features in each picture of a moving camera of more than LONG, which sees each point in many of them.
+LONG, FEATURES_OF_LONG = 200, 1024
 # Pictures of one moving camera are matched with those so many frames away, and with some that look alike.
 FRAMES = Pairing((1, 2, 4, 8, 16, 32), alike=5, every=3)
 # Photographs are matched with those that look alike, and with the next ones, which mostly were taken there, too.
@@ -169,7 +171,8 @@ def _find_moving_camera(root: Path, footage: Footage) -> Found:
     count = frame_count(footage)
     names = [f"{number:06d}" for number in range(count)]
     pictures = (Picture(number, 0, grey.round().astype(np.uint8), None) for number, grey in enumerate(greys(footage)))
-    structure = reconstruct(pictures, names, [0] * count, FEATURES_OF_MANY if count > MANY else ATTEMPTS[0][0], FRAMES)
+    features = FEATURES_OF_LONG if count > LONG else FEATURES_OF_MANY if count > MANY else ATTEMPTS[0][0]
+    structure = reconstruct(pictures, names, [0] * count, features, FRAMES)
     return Found("moving camera", (footage,), (UNKNOWN,), tuple(names), structure, False)
 
 

@@ -22,6 +22,8 @@ from kpc.format.common.progress import Progress
 LARGEST_SIDE = 1600
 # Where there are more pictures than MANY, larger than FINE_SIDE, features are not sought at twice their resolution.
 MANY, FINE_SIDE = 100, 800
+# More views than MANY are first placed by so many tracks in each, the longest ones; all tracks adjust them then.
+TRACKS = 300
 
 SEED = 0
 
@@ -144,6 +146,7 @@ def reconstruct(
             "seed": SEED,
             "is_rig": pairing.steps is None,  # views of one size may differ in their lenses
             "features": features,
+            "tracks": TRACKS if len(names) > MANY else None,
             "threads": os.cpu_count() or 1,
             "pictures": described,
             "views": [{"name": name, "camera": camera} for name, camera in zip(names, cameras, strict=True)],
