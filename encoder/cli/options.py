@@ -381,6 +381,8 @@ def _check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         parser.error("--only names a group; give the length of groups with --group 10s")
     if given.keep_checkpoint is not None and given.group is not None and given.only is None:
         parser.error("--keep-checkpoint holds a single scene; with --group give --only N, too")
+    if given.audio == "none" and given.audio_bitrate is not None:
+        parser.error("--audio none leaves the sound out; drop --audio-bitrate")
     if given.dry_run and given.resume:
         parser.error("--dry-run estimates a whole run; drop --resume")
 

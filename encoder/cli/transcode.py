@@ -164,7 +164,8 @@ def check_outputs(options: Options) -> None:
     """
     if options.output.exists() and options.source.is_file() and options.output.samefile(options.source):
         raise UsageError(f"{options.output}: is the source, too; write elsewhere with -o")
-    for output in filter(None, (options.output, options.keep_checkpoint)):
-        cli.check_writable(output)
+    cli.check_writable(options.output)
+    if options.keep_checkpoint is not None:
+        cli.check_writable(options.keep_checkpoint, option="--keep-checkpoint")
     if options.output.suffix.lower() != ".kpc":
         raise UsageError(f"{options.output}: kpenc writes .kpc files; end the name in .kpc")

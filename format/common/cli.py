@@ -139,12 +139,13 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)  # unless it has been renamed
 
 
-def check_writable(path: Path, *, is_folder: bool = False) -> None:
+def check_writable(path: Path, *, is_folder: bool = False, option: str = "-o") -> None:
     """Check, before work that may take hours, that a file or a folder can be written.
 
     Args:
         path: of the file, whose folder must be there, or of a folder, which may be made with those above it.
         is_folder: which of both.
+        option: which names it on the command line.
 
     Raises:
         UsageError: a folder is missing, is a file, or has the name of the file.
@@ -160,9 +161,9 @@ def check_writable(path: Path, *, is_folder: bool = False) -> None:
     if above.exists() and not above.is_dir():
         raise UsageError(f"{above}: is a file, not a folder; give another name")
     if not above.is_dir():
-        raise UsageError(f"{above}: no such folder; make it first, or choose another place with -o")
+        raise UsageError(f"{above}: no such folder; make it first, or choose another place with {option}")
     if not os.access(above, os.W_OK):
-        raise OSError(errno.EACCES, "no permission to write there; choose another place with -o", str(path))
+        raise OSError(errno.EACCES, f"no permission to write there; choose another place with {option}", str(path))
 
 
 def make_folder(path: Path) -> None:

@@ -56,7 +56,7 @@ def _command(argv: list[str]) -> None:
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames} is not positive")
     if options.screenshot is not None:
-        cli.check_writable(options.screenshot)
+        cli.check_writable(options.screenshot, option="--screenshot")
     cli.make_folder(Path(options.folder or "."))
     path = None if options.path is None else CameraPath.load(options.path)
 
@@ -114,12 +114,13 @@ def _parser() -> argparse.ArgumentParser:
         help="limit for the scene, in main memory and on the graphics card together (default: "
         f"{DEFAULT_BUDGET / 1e9:.3g}GB)",
     )
-    parser.add_argument(
+    quality = parser.add_mutually_exclusive_group()
+    quality.add_argument(
         "--quality",
         choices=list(LEVELS),
         help="quality level, which then stays (default: as last time; at first chosen for the device)",
     )
-    parser.add_argument(
+    quality.add_argument(
         "--target-fps",
         type=cli.frame_rate(*TARGET_FPS),
         metavar="F",

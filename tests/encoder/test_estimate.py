@@ -107,4 +107,6 @@ def test_a_dry_run_leaves_nothing(
     with pytest.raises(SystemExit, match="2"):
         kpenc.main([*words, "--resume"])
     with pytest.raises(SystemExit, match="2"):
+        kpenc.main([*words, "--audio", "none", "--audio-bitrate", "64000"])
+    with pytest.raises(SystemExit, match="2"):
         kpenc.main(words[:-1])  # only a dry run needs no -o

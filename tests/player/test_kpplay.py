@@ -224,6 +224,7 @@ def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
         (["{scene}", "--memory", "1MB"], 1, "--memory"),
         (["{scene}", "--size", "7x7"], 2, "--size"),
         (["{scene}", "--frames", "0"], 2, "--frames"),
+        (["{scene}", "--screenshot", "nowhere/x.png"], 2, "choose another place with --screenshot"),
         (["{scene}", "--screenshot", "x.bmp"], 2, "x.bmp"),
         (["{scene}", "--screenshot", "x.jpg"], 2, "x.jpg"),
         (["{scene}", "--screenshot", "x.png/"], 2, "x.png/"),
@@ -233,6 +234,7 @@ def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
         (["{scene}", "--path", "{scene}"], 1, "tiny.kpc"),
         (["{scene}", "--quality", "perfect"], 2, "fastest"),
         (["{scene}", "--target-fps", "0"], 2, "--target-fps"),
+        (["{scene}", "--target-fps", "9", "--quality", "fast"], 2, "not allowed with"),
     ],
 )
 def test_bad_input_is_reported_before_a_window_opens(

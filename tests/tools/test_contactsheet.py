@@ -45,6 +45,14 @@ def ambiguous(folder: Path) -> Path:
     return folder
 
 
+def test_a_sheet_is_not_put_among_the_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth, rendered = fill(tmp_path / "gt", ["a"], 0), fill(tmp_path / "out", ["a"], 0)
+    for folder in (truth, rendered):
+        assert contactsheet.main([str(truth), str(rendered), "-o", str(folder / "sheet.png")]) == 2
+        assert f"would lie among the pictures of {folder}" in capsys.readouterr().err
+        assert [p.name for p in folder.iterdir()] == ["a.png"]
+
+
 @pytest.mark.parametrize("name", ["sheet", "sheet.webp", "sheet.gif", "sheet.mp4", "sheet.png/"])
 def test_a_sheet_is_a_png_or_jpeg(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
     folder = fill(tmp_path / "gt", ["a"], 0)

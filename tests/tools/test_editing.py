@@ -105,6 +105,11 @@ def test_moving_and_scaling_copies_planes_decoder_and_occupancy(variant, tmp_pat
     assert one == other and len(one) > 12
 
 
+def test_a_box_smaller_than_a_file_holds_is_refused():
+    with pytest.raises(UsageError, match=r"--scale 1e-10: an edge of the box would be"):
+        placed(quantised(), Placement(np.eye(3), 1e-10, np.zeros(3)))
+
+
 # --- time
 
 

@@ -72,6 +72,23 @@ def test_provenance_comes_from_a_file_and_goes(folder):
     assert not read(again).metadata and again.read_bytes() == (folder / "scene.kpc").read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--provenance", "made.json", "--no-provenance"], "not allowed with"),
+        (["--transparent", "--no-transparent"], "not allowed with"),
+        (["--scale", "1e9"], "--scale 1e+09: the scene would reach to"),
+        (["--scale", "1e8", "--move", "1e9,0,0"], "--scale 1e+08: the scene would reach to"),
+    ],
+)
+def test_contradictions_and_what_no_file_holds_are_refused(folder, capsys, words, message):
+    try:
+        code = kpedit.main([str(folder / "scene.kpc"), "-o", str(folder / "refused.kpc"), *words])
+    except SystemExit as end:
+        code = end.code
+    assert code == 2 and message in capsys.readouterr().err and not (folder / "refused.kpc").exists()
+
+
 def test_view_limits_are_found_and_set_and_taken_away(folder):
     found = read(edit(folder, "--view-limits", "auto")).metadata
     limits = found.view_limits

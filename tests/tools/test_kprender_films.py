@@ -126,6 +126,7 @@ def test_a_clip_that_hardly_moves_has_too_many_pictures() -> None:
         (["-o", "x.mp4", "--depth", "--matte"], "--depth: a film shows depth or --matte"),
         (["--step", 0], "--step"),
         (["--shutter", 1.5], "--shutter"),
+        (["--quality", "fast"], "--quality fast: is of the gl backend"),
         (["--samples", 17], "--samples"),
         (["--background", "greenish"], "no colour"),
         (["--camera", 2], "cameras 0 to 1"),

@@ -64,7 +64,7 @@ def _command(argv: list[str]) -> None:
     }
     out: Path | None = options.out
     if out is not None:
-        cli.check_writable(out)
+        cli.check_writable(out, option="--out")
     records: list[Record] = []
     try:
         for record in options.measure(options, origin):

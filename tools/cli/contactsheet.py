@@ -160,9 +160,12 @@ def _command(argv: list[str]) -> None:
         "--rows", type=int, default=4, help="number of rows at most, evenly spaced over all pairs (default: 4)"
     )
     options = parser.parse_args(argv)
+    cli.check_writable(options.output)
     for folder in (options.truth, options.rendered):
         if not folder.is_dir():
             raise UsageError(f"{folder}: no such folder")
+        if options.output.absolute().parent.samefile(folder):
+            raise UsageError(f"{options.output}: would lie among the pictures of {folder}; put the sheet elsewhere")
     if options.rows < 1:
         raise UsageError(f"--rows {options.rows} is not positive")
     found, alone = pairs(options.truth, options.rendered)

@@ -85,19 +85,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--up", type=_direction, metavar="X,Y,Z", help="which direction is up in the new file")
     parser.add_argument("--metres-per-unit", type=_length, metavar="M", help="length of a unit in the new file")
-    parser.add_argument(
-        "--transparent",
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help="the scene is, or is not, meant to be laid over other pictures",
-    )
-    parser.add_argument(
+    transparent = parser.add_mutually_exclusive_group()
+    for option, value, what in (("--transparent", True, "is"), ("--no-transparent", False, "is not")):
+        text = f"the scene {what} meant to be laid over other pictures"
+        transparent.add_argument(option, action="store_const", const=value, dest="transparent", help=text)
+    provenance = parser.add_mutually_exclusive_group()
+    provenance.add_argument(
         "--provenance",
         type=Path,
         metavar="JSON",
         help="a file with members of the provenance, for scenes that do not hold their own",
     )
-    parser.add_argument("--no-provenance", action="store_true", help="leave out how the file was made")
+    provenance.add_argument("--no-provenance", action="store_true", help="leave out how the file was made")
     _add_edits(parser)
     return parser
 

@@ -6,13 +6,16 @@ The symbols of a scene stay as they are; a box that is turned has its planes tra
 scene in device coordinates lie in the frame of its reference camera, which may be turned by any angle.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common.errors import UsageError
+from kpc.format.container.scene_layout import BOX_LIMIT
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.metadata import Metadata, camera_document, rounded
 from kpc.format.scene.motion import QuantisedMotion
@@ -77,15 +80,23 @@ def placed(scene: QuantisedScene, placement: Placement) -> QuantisedScene:
     """Return a scene at another place.
 
     Raises:
-        UsageError: its box cannot be turned by this angle, or is too small for where it is moved to.
+        UsageError: its box cannot be turned by this angle, or is too small for where it is moved to; or it would be
+            larger or smaller than a file holds.
     """
     cameras = tuple(placement.camera(camera) for camera in scene.cameras)
+    _check_fits(placement, [camera.camera_to_world[:3, 3] for camera in cameras])
     scene = replace(scene, cameras=cameras, metadata=placed_metadata(scene.metadata, placement))
     if isinstance(scene.mapping, DeviceCoordinates):
         return replace(scene, mapping=_placed_frame(scene.mapping, placement))
     if placement.is_turned:
         scene = _turned(scene, placement.turn)
     aabb = (placement.factor * scene.aabb.astype(np.float64) + placement.shift).astype(np.float32)
+    _check_fits(placement, aabb)
+    if (smallest := placement.factor * np.diff(scene.aabb, axis=0).min()) < 1 / BOX_LIMIT:
+        raise UsageError(
+            f"--scale {placement.factor:g}: an edge of the box would be {smallest:.3g}; a file holds lengths from "
+            f"{1 / BOX_LIMIT:.3g}; choose a larger factor"
+        )
     edges, wanted = aabb[1] - aabb[0], placement.factor * (scene.aabb[1].astype(np.float64) - scene.aabb[0])
     if not (np.abs(edges - wanted) <= EDGE_TOLERANCE * wanted).all():
         raise UsageError("--move: so far from the origin the box would lose its shape by rounding; scale it up first")
@@ -111,9 +122,21 @@ def placed_metadata(metadata: Metadata, placement: Placement) -> Metadata:
             "distance": rounded([placement.factor * distance for distance in limits["distance"]]),
             "reach": rounded([placement.factor * limits["reach"]])[0],
         }
+        _check_fits(placement, [changed["view_limits"]["focus"], changed["view_limits"]["distance"]])
     if "metres_per_unit" in document:
         changed["metres_per_unit"] = rounded([document["metres_per_unit"] / placement.factor])[0]
     return metadata.with_members(**changed)
+
+
+def _check_fits(placement: Placement, numbers: Iterable[npt.ArrayLike]) -> None:
+    """Raise a UsageError if coordinates or lengths of a scene that is put elsewhere exceed what a file holds."""
+    largest = max((float(np.abs(number).max()) for number in numbers), default=0.0)
+    if largest > BOX_LIMIT:
+        option = "--move" if placement.factor == 1 else f"--scale {placement.factor:g}"
+        raise UsageError(
+            f"{option}: the scene would reach to {largest:.3g}; a file holds coordinates and lengths up to "
+            f"{BOX_LIMIT:.3g}; choose less"
+        )
 
 
 def _placed_frame(mapping: DeviceCoordinates, placement: Placement) -> DeviceCoordinates:

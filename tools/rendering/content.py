@@ -31,6 +31,8 @@ def renderer_of(loaded: Scene | GroupedScene, options: argparse.Namespace) -> tu
 
     With a transparent background colours are multiplied by opacity.
     """
+    if options.backend == "reference" and options.quality != "reference":
+        raise UsageError(f"--quality {options.quality}: is of the gl backend; leave it out, or --backend reference")
     appearance_of(loaded.at(0.0)[0], options.appearance)  # reports an unknown name at once
     draw, name = _reference_drawing(options) if options.backend == "reference" else _gl_drawing(options)
     needed: list[Scene] = []
