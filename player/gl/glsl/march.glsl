@@ -6,7 +6,9 @@
 // one appearance. ROWS: 1 where time rows are multiplied in at every sample. CONTRACTED: 1 where the planes hold what
 // lies outside the box, too. MOTION: 1 where samples are displaced. NDC: 1 where all this is in normalised device
 // coordinates. DEPTH_LIMIT: 1 where rays end at the depths of a picture that this one becomes part of. COMPUTE: 1 for a
-// compute shader (GL 4.3). COUNTED: 1 where look-ups of cells are counted.
+// compute shader (GL 4.3). COUNTED: 1 where look-ups of cells are counted. WEIGHTS_IN_BLOCK: defined where the
+// decoder's weights are no constants but in a uniform block, so that a loop over them makes a shorter shader.
+// BASIS_IN_LOOP: defined where, besides, an array that is indexed in a loop is as fast as registers.
 
 #include "ray.glsl"
 #include "space.glsl"
@@ -86,12 +88,25 @@ void look_along(vec3 d) {
 #unroll i BASIS
     basis[i] = b2[i];
 #end
+#ifdef WEIGHTS_IN_BLOCK
+    for (int h = 0; h < HIDDEN; h++) {
+        float hidden = max(direction_hidden(e, h), 0.0);
+#ifdef BASIS_IN_LOOP
+        for (int i = 0; i < BASIS; i++) basis[i] += hidden * w2[i * HIDDEN + h];
+#else
+#unroll i BASIS
+        basis[i] += hidden * w2[i * HIDDEN + h];
+#end
+#endif
+    }
+#else
 #unroll h HIDDEN
     float hidden_##h = max(direction_hidden(e, h), 0.0);
 #unroll i BASIS
     basis[i] += hidden_##h * w2[i * HIDDEN + h];
 #end
 #end
+#endif
 }
 #else
 #define basis b2

@@ -304,6 +304,28 @@ test('groups are opened ahead, blended, and released behind the playhead', async
   });
 });
 
+test('the beginning of another group is requested once when the playhead jumps there', async () => {
+  const group = scene({ ...SHORT, frameCount: 101, segmentRows: 32 });
+  const { valueCount } = new Container(group).header;
+  const clipFile = grouped([group, group, group], 101, 1, valueCount);
+  const { offset } = new Container(clipFile).index[2];
+  const content = new Container(group).index.findIndex(({ kind }) => kind === 'PLNE');
+  await withServer(clipFile, {}, async (server) => {
+    await withClip(server.url, {}, async (clip) => {
+      const position = { time: 0.9 * clip.duration };
+      await until(clip, () => {
+        clip.setPlayhead(position);
+        return clip.canShow(position.time);
+      });
+      assert.equal(clip.parts(position.time)[0].scene.group, 2);
+      const planes = offset + new Container(group).index[content].offset;
+      const ranges = server.requests.map((range) => range.split('-').map(Number));
+      const opening = ranges.filter(([from, to]) => from < planes && to >= offset);
+      assert.equal(opening.length, 1, server.requests.join(' '));
+    });
+  });
+});
+
 test('a damaged chunk is fetched again, and reported if it stays so', async () => {
   const damaged = LONG.slice();
   const entry = new Container(LONG).index[12];

@@ -47,6 +47,19 @@ test('decodes all segments as one core does', async () => {
   });
 });
 
+test('coarse scales are decoded before finer ones that came sooner', async () => {
+  await withPool({ size: 1 }, async (pool) => {
+    const done: number[] = [];
+    const ranks = [1, 2, 1, 0, 2, 0];
+    const runs = ranks.map(async (rank, k) => {
+      await pool.run(segmentTask(PLANES[0]), { rank });
+      done.push(k);
+    });
+    await Promise.all(runs);
+    assert.deepEqual(done, [3, 5, 0, 2, 1, 4]);
+  });
+});
+
 test('reads all of a scene but its planes', async () => {
   const { index, header } = new Container(bytes);
   const bodies = new Map<number, Uint8Array>();

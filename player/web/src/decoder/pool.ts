@@ -23,6 +23,8 @@ export interface PoolOptions {
 export interface RunOptions {
   /** Numbers that the task decodes: a measure of its time and memory. */
   numbers?: number;
+  /** Tasks of a lower number are done before those of a higher one that wait, too. */
+  rank?: number;
   /** Ends the wait for a task; one that has not begun is not done. */
   signal?: AbortSignal;
   /** Buffers of the task that are moved to the worker. */
@@ -37,6 +39,7 @@ interface Job {
   task: Task;
   moved: Transferable[];
   numbers: number;
+  rank: number;
   resolve(result: unknown): void;
   reject(error: unknown): void;
 }
@@ -92,13 +95,13 @@ export class DecoderPool {
    * Throws a FormatError for what is wrong with its data, a BudgetError if it takes more than the pool's memory, and a
    * KpcError if there is no worker, the worker breaks down or takes longer than the deadline, or `signal` aborts.
    */
-  run<T extends Task>(task: T, { numbers = 0, signal, moved = [] }: RunOptions = {}): Promise<Result<T>> {
+  run<T extends Task>(task: T, { numbers = 0, rank = 0, signal, moved = [] }: RunOptions = {}): Promise<Result<T>> {
     return new Promise((resolve, reject) => {
       if (this.#isClosed || signal?.aborted) return reject(new KpcError('decoding was ended', 'aborted'));
       if (numbers * BYTES_PER_NUMBER > this.#memory) {
         return reject(new BudgetError('decoding takes more memory than the budget allows'));
       }
-      const job: Job = { id: ++this.#lastId, task, moved, numbers, resolve: resolve as Job['resolve'], reject };
+      const job: Job = { id: ++this.#lastId, task, moved, numbers, rank, resolve: resolve as Job['resolve'], reject };
       const abort = () => {
         this.#queue = this.#queue.filter((waiting) => waiting !== job);
         reject(new KpcError('decoding was ended', 'aborted'));
@@ -113,7 +116,8 @@ export class DecoderPool {
         settled();
         reject(error);
       };
-      this.#queue.push(job);
+      const behind = this.#queue.findIndex((waiting) => waiting.rank > rank);
+      this.#queue.splice(behind < 0 ? this.#queue.length : behind, 0, job);
       this.#pump();
     });
   }

@@ -24,6 +24,11 @@ export class ClipScenes {
     return clip.parts(time).map(({ scene, time, share }) => ({ scene: this.#drawn(scene), time, share }));
   }
 
+  /** Return a moment of each scene that is shown or will be. */
+  all(clip: Clip): Moment[] {
+    return clip.scenes.map((scene) => ({ scene: this.#drawn(scene), time: 0, share: 1 }));
+  }
+
   /** Forget a scene that the clip no longer holds. */
   release(scene: SceneStream): void {
     const drawn = this.#scenes.get(scene);

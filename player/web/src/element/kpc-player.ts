@@ -418,6 +418,7 @@ export class KpcPlayer extends AudibleElement implements Model {
   }
 
   #clocked(event: ClockEvent): void {
+    if (event === 'seeking') this.#session?.seek();
     if (event === 'playing') this.#plays.settle();
     if (event === 'pause')
       this.#plays.settle(this.duration === 0 ? undefined : new DOMException('paused', 'AbortError'));

@@ -93,9 +93,10 @@ export class Picture {
     return this.#renderer.drawInto(frames, this.#scenes.moments(clip, time), options).pictures;
   }
 
-  /** Have shaders compiled for that, before there is anything to draw; return whether all are. */
-  prepare(clip: Clip, time: number, camera: Camera, { level, part }: ShownOptions): boolean {
-    return this.#renderer.prepare(camera, this.#scenes.moments(clip, time), { level, part });
+  /** Have shaders compiled for all scenes of a clip, before there is anything to draw; return whether all are. */
+  prepare(clip: Clip, camera: Camera, { level, part }: ShownOptions): boolean {
+    const areReady = this.#scenes.all(clip).map((moment) => this.#renderer.prepare(camera, [moment], { level, part }));
+    return areReady.every((isReady) => isReady);
   }
 
   /** Forget a scene that the clip no longer holds. */

@@ -173,6 +173,12 @@ export class Session {
     if (this.#request === 0 && !this.#isClosed) this.#request = requestAnimationFrame((now) => this.#frame(now));
   }
 
+  /** Have fetched at once what a time that was sought needs: frames may be late while the card is busy. */
+  seek(): void {
+    if (this.clip !== null && this.view !== null) this.#follow(this.clip);
+    this.wake();
+  }
+
   /** Draw again if what is to be shown, in words, is not what it was. */
   wakeIfChanged(shown: string): void {
     if (shown === this.#shownWords) return;
@@ -245,17 +251,15 @@ export class Session {
     const seconds = this.#lastFrame === 0 ? 0 : (now - this.#lastFrame) / 1000;
     this.#input.advance(seconds);
     const isMoving = view.advance(seconds) || this.#input.isActive;
+    const hasTaken = this.#attempt(() => this.#picture?.take(clip)) ?? false; // a group may be shown thereafter
+    if (this.#isClosed) return;
     this.#advance(clip, seconds);
     if (this.#isClosed) return; // by a listener
     if (view.view !== this.#shownView) {
       if (this.#shownView !== null) this.#events.viewChanged();
       this.#shownView = view.view;
     }
-    try {
-      this.#draw();
-    } catch (error) {
-      this.#reduceOrFail(error);
-    }
+    this.#attempt(() => this.#draw(hasTaken));
     if (this.#isClosed) return;
     this.#events.frame();
     const isGoing = isMoving || !clock.paused || clock.isSeeking || !this.#isSharp;
@@ -263,26 +267,31 @@ export class Session {
     if (isGoing) this.wake();
   }
 
-  /** Let time pass. */
-  #advance(clip: Clip, seconds: number): void {
+  /** Let the clip fetch what the clock's time needs. */
+  #follow(clip: Clip): void {
     const { clock, hasPoster } = this.#options;
     const isPreview = !this.fetches;
     if (!isPreview || !hasPoster())
       clip.setPlayhead({ time: clock.time, rate: clock.speed, loop: clock.loop, isPreview });
+  }
+
+  /** Let time pass. */
+  #advance(clip: Clip, seconds: number): void {
+    const { clock } = this.#options;
+    this.#follow(clip);
     clock.tick(this.sound?.advance(seconds) ?? seconds, (time) => this.isShown && clip.canShow(time));
     if (this.isShown && this.fetches) this.sound?.follow(); // a listener may have ended all this
   }
 
-  #draw(): void {
+  #draw(hasTaken: boolean): void {
     const { clip, view } = this;
     const [width, height] = this.#size;
     if (clip === null || view === null || this.#picture === null || width === 0 || height === 0) return;
     const { time, isSeeking } = this.#options.clock;
-    const hasTaken = this.#picture.take(clip);
     const camera = cameraOf(view.view, width, height);
     // Nothing that is worse than the poster, or than the picture before a jump.
     if (!this.#isInSight || !(clip.canShow(time) || (this.isShown && !isSeeking))) {
-      const isPrepared = this.#picture.prepare(clip, time, camera, this.#shownOptions());
+      const isPrepared = this.#picture.prepare(clip, camera, this.#shownOptions());
       this.#isSharp = isPrepared && !hasTaken;
       return;
     }
@@ -290,6 +299,7 @@ export class Session {
     const { pictures, isSharp } = this.#picture.draw(clip, time, camera, this.#shownOptions());
     this.pictures = pictures;
     this.#isSharp = isSharp;
+    if (clip.scenes.length > 1) this.#picture.prepare(clip, camera, this.#shownOptions());
     if (pictures > 0 && !this.isShown) {
       this.isShown = true;
       this.#events.shown();
@@ -299,6 +309,16 @@ export class Session {
   #shownOptions(): ShownOptions {
     const shown = this.#options.shown();
     return this.#isReduced ? { ...shown, level: 'fastest' } : shown;
+  }
+
+  /** Do something on the card, and say what it returns; undefined if it fails. */
+  #attempt<T>(act: () => T): T | undefined {
+    try {
+      return act();
+    } catch (error) {
+      this.#reduceOrFail(error);
+      return undefined;
+    }
   }
 
   /** Try once with as little memory as possible before giving up. */

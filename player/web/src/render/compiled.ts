@@ -34,6 +34,15 @@ export class CompiledPrograms {
     return program;
   }
 
+  /** Delete a program, or give up compiling it. */
+  forget(key: string): void {
+    const [compilation, program] = [this.#compilations.get(key), this.#programs.get(key)];
+    if (compilation) this.device.abandon(compilation);
+    if (program) this.device.release(program);
+    this.#compilations.delete(key);
+    this.#programs.delete(key);
+  }
+
   release(): void {
     for (const compilation of this.#compilations.values()) this.device.abandon(compilation);
     for (const program of this.#programs.values()) this.device.release(program);

@@ -29,6 +29,12 @@ export interface Texture {
   readonly size: readonly number[]; // width, height and, of a volume, depth
 }
 
+/** Numbers that shaders hold in a uniform block. */
+export interface UniformBuffer {
+  readonly handle: WebGLBuffer;
+  readonly bytes: number;
+}
+
 export interface Framebuffer {
   readonly handle: WebGLFramebuffer;
   readonly width: number;
@@ -49,6 +55,9 @@ export interface Compilation {
   readonly fence: WebGLSync | null;
 }
 
+/** The name of the uniform block that shaders may have. */
+export const BLOCK = 'SceneNumbers';
+
 const BYTES: Record<Format, number> = {
   ...{ rgba32f: 16, rgba16f: 8, rgba8: 4, rg32f: 8, rg16f: 4, r8ui: 1 },
   ...{ depth24stencil8: 4, depth24: 4, depth32f: 4, depth32fstencil8: 8, depth16: 2 },
@@ -59,6 +68,10 @@ export const bytesOf = ({ format, size }: Texture): number => BYTES[format] * si
 export class Device {
   readonly maxTextureSize: number;
   readonly maxVolumeSize: number;
+  /** Bytes of a uniform block. */
+  readonly maxBlockSize: number;
+  /** Where a buffer is bound to BLOCK; other code on the page begins with 0. */
+  readonly #blockBinding: number;
   /** Whether float32 textures can be filtered; many telephones filter float16 only. */
   readonly filtersFloat32: boolean;
   /** Whether float32 textures can be drawn to; otherwise float16. */
@@ -100,6 +113,8 @@ export class Device {
     this.#parallel = gl.getExtension('KHR_parallel_shader_compile');
     this.maxTextureSize = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.maxVolumeSize = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
+    this.maxBlockSize = gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE);
+    this.#blockBinding = gl.getParameter(gl.MAX_UNIFORM_BUFFER_BINDINGS) - 1;
     this.#vertices = this.#made(gl.createVertexArray());
   }
 
@@ -187,6 +202,18 @@ export class Device {
     gl.bindTexture(texture.size.length === 3 ? gl.TEXTURE_3D : gl.TEXTURE_2D, texture.handle);
   }
 
+  uniformBuffer(values: Float32Array<ArrayBuffer>): UniformBuffer {
+    const { gl } = this;
+    const handle = this.#made(gl.createBuffer());
+    gl.bindBuffer(gl.UNIFORM_BUFFER, handle);
+    gl.bufferData(gl.UNIFORM_BUFFER, values, gl.STATIC_DRAW);
+    return { handle, bytes: values.byteLength };
+  }
+
+  useBlock({ handle }: UniformBuffer): void {
+    this.gl.bindBufferBase(this.gl.UNIFORM_BUFFER, this.#blockBinding, handle);
+  }
+
   framebuffer(textures: readonly Texture[]): Framebuffer {
     const { gl } = this;
     const handle = this.#made(gl.createFramebuffer());
@@ -248,6 +275,8 @@ export class Device {
       this.release({ handle, uniforms: new Map() });
       throw error;
     }
+    const block = gl.getUniformBlockIndex(handle, BLOCK);
+    if (block !== gl.INVALID_INDEX) gl.uniformBlockBinding(handle, block, this.#blockBinding);
     return { handle, uniforms: this.#uniforms(handle) };
   }
 
@@ -342,10 +371,11 @@ export class Device {
   }
 
   /** Delete an object. */
-  release(object: Texture | Framebuffer | Program): void {
+  release(object: Texture | Framebuffer | Program | UniformBuffer): void {
     const { gl } = this;
     if ('format' in object) gl.deleteTexture(object.handle);
     else if ('uniforms' in object) gl.deleteProgram(object.handle);
+    else if ('bytes' in object) gl.deleteBuffer(object.handle);
     else gl.deleteFramebuffer(object.handle);
     this.#objects--;
   }

@@ -170,7 +170,11 @@ export class Renderer {
 
   /** Have shaders compiled that `draw` will need, while planes are still to come; return whether all are. */
   prepare(camera: Camera, moments: readonly Moment[], options: DrawOptions = {}): boolean {
-    return this.isLost || this.#isReady(viewOf(camera, moments, options), this.#wanted(camera, moments, options));
+    if (this.isLost) return true;
+    // Nothing is given to the card while it is asked whether it has memory; then textures are made before it is asked.
+    if (this.#device.isAsked && !this.#hasMemory()) return false;
+    const isReady = this.#isReady(viewOf(camera, moments, options), this.#wanted(camera, moments, options));
+    return this.#hasMemory() === true && isReady;
   }
 
   /**

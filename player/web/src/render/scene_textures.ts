@@ -2,12 +2,13 @@
 
 import { displacementsAt, Layout, rowWidth, timeRows } from './atlas.js';
 import { columnsOf } from './camera.js';
-import { CompiledPrograms } from './compiled.js';
 import { RenderError } from './context.js';
-import { bytesOf, type Compilation, type Device, type Program, type Texture } from './device.js';
+import { bytesOf, type Device, type Program, type Texture } from './device.js';
+import { SceneNumbers } from './scene_numbers.js';
 import { occupancySlot, occupiedIn, type PlaneRows, type SceneSource, type SpacePlane } from './scene_source.js';
-import { constants, type Defines } from './shader.js';
-import { blockArrays, decoderArrays, decoderShape, planesShape } from './shader_constants.js';
+import type { Defines, Written } from './shader.js';
+import { decoderShape, planesShape } from './shader_constants.js';
+import { SharedPrograms } from './shared_programs.js';
 
 /** Texture units. */
 export const UNIT = {
@@ -22,8 +23,6 @@ export const UNIT = {
   otherSums: 3,
   limits: 4,
 } as const;
-// vec4s of decoder weights that a shader may hold, as on the desktop; compilers choke on more.
-const MOST_CONSTANTS = 8192;
 
 /** What shaders look up of a scene: planes, time rows, displacements and distances to occupied cells. */
 export class SceneTextures {
@@ -117,9 +116,6 @@ export class SceneTextures {
   }
 }
 
-const keyOf = (name: string, { upsampling }: Layout, defines: Defines) =>
-  [name, upsampling, ...Object.entries(defines).flat()].join(' ');
-
 /** Return the macros that describe a scene whose planes lie in a layout. */
 export function sceneDefines(scene: SceneSource, layout: Layout): Defines {
   return {
@@ -131,50 +127,53 @@ export function sceneDefines(scene: SceneSource, layout: Layout): Defines {
   };
 }
 
-/** The programs of a scene, compiled when they are first needed, with all uniforms set that never change. */
+/** The programs of a scene, compiled when they are first needed for it or for a scene of the same shape. */
 export class Programs {
-  readonly #decoderWeights: string;
-  readonly #compiled: CompiledPrograms;
+  readonly #shared: SharedPrograms;
+  readonly #numbers: SceneNumbers;
+  /** What programs are known by to all scenes. */
+  readonly #keys = new Map<string, string>();
 
   constructor(
     readonly device: Device,
     readonly textures: SceneTextures,
   ) {
-    const { scene, layout } = textures;
-    const arrays = decoderArrays(scene.decoder, scene, layout);
-    const count = Object.values(arrays).reduce((sum, { values }) => sum + values.length, 0);
-    if (count > 4 * MOST_CONSTANTS) {
-      throw new RenderError(`the decoder has ${count} weights, a shader takes ${4 * MOST_CONSTANTS}`);
-    }
-    this.#decoderWeights = constants(arrays);
-    this.#compiled = new CompiledPrograms(device);
+    this.#shared = SharedPrograms.on(device);
+    this.#numbers = new SceneNumbers(device, textures.scene, textures.layout);
   }
 
   /** Whether a program is compiled; begin with it if not. */
   isReady(name: string, layout: Layout, defines: Defines): boolean {
-    return this.#compiled.isReady(
-      keyOf(name, layout, defines),
-      () => this.#begin(name, layout, defines),
-      (program) => this.#setConstant(program),
-    );
+    const key = this.#keyOf(name, layout, defines);
+    return this.#shared.isReady(this, key, () => this.device.compile(name, ...this.#parts(layout, defines)));
   }
 
   /** Return a program that reads planes in a layout; `defines` besides those that describe the scene. */
   get(name: string, layout: Layout, defines: Defines = {}): Program {
-    return this.#compiled.get(
-      keyOf(name, layout, defines),
-      () => this.#begin(name, layout, defines),
-      (program) => this.#setConstant(program),
-    );
+    const key = this.#keyOf(name, layout, defines);
+    const begin = () => this.device.compile(name, ...this.#parts(layout, defines));
+    const [program, isOthers] = this.#shared.get(this, key, begin);
+    if (isOthers) this.#setConstant(program);
+    this.#numbers.use(layout);
+    return program;
   }
 
-  #begin(name: string, layout: Layout, defines: Defines): Compilation {
-    const { scene } = this.textures;
-    const macros = { ...sceneDefines(scene, layout), COMPUTE: 0, COUNTED: 0, DEPTH_LIMIT: 0, ...defines };
-    const written = { decoder_weights: this.#decoderWeights, plane_blocks: constants(blockArrays(scene, layout)) };
-    return this.device.compile(name, macros, written);
+  /** Return the macros of a shader, and the files that are made for it. */
+  #parts(layout: Layout, defines: Defines): [Defines, Written] {
+    const macros = { ...sceneDefines(this.textures.scene, layout), COMPUTE: 0, COUNTED: 0, DEPTH_LIMIT: 0 };
+    return [{ ...macros, ...this.#numbers.defines, ...defines }, this.#numbers.files(layout)];
   }
 
+  #keyOf(name: string, layout: Layout, defines: Defines): string {
+    const short = [name, layout.upsampling, ...Object.entries(defines).flat()].join(' ');
+    const known = this.#keys.get(short);
+    if (known !== undefined) return known;
+    const key = JSON.stringify([name, ...this.#parts(layout, defines)]);
+    this.#keys.set(short, key);
+    return key;
+  }
+
+  /** Set all uniforms that never change for a scene. */
   #setConstant(program: Program): void {
     const { scene, rows, motion } = this.textures;
     const { aabb } = scene.head;
@@ -199,6 +198,7 @@ export class Programs {
   }
 
   release(): void {
-    this.#compiled.release();
+    this.#shared.release(this);
+    this.#numbers.release();
   }
 }

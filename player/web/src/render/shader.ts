@@ -121,6 +121,18 @@ export function constants(arrays: Readonly<Record<string, ConstantArray>>): stri
   return lines.join('');
 }
 
+/** Return GLSL that declares arrays as a uniform block, and the numbers that it holds, each array of vec4s in order. */
+export function uniformBlock(name: string, arrays: Readonly<Record<string, ConstantArray>>) {
+  const lines = Object.entries(arrays).map(([array, { kind, values }]) => {
+    return `    ${kind} ${array}[${kind === 'vec4' ? values.length / 4 : values.length}];\n`;
+  });
+  // A number of its own takes as much room as a vec4 in std140.
+  const numbers = Object.values(arrays).flatMap(({ kind, values }) =>
+    Array.from(values).flatMap((x) => (kind === 'vec4' ? [x] : [x, 0, 0, 0])),
+  );
+  return { text: `layout(std140) uniform ${name} {\n${lines.join('')}};\n`, numbers: Float32Array.from(numbers) };
+}
+
 /** Return a float32 with ten digits and, as Python does, two of the exponent. */
 function exact(x: number): string {
   return Math.fround(x)

@@ -201,10 +201,15 @@ export class Clip extends EventTarget {
     const isWaiting = group !== this.#shown.group;
     const wanted = isWaiting ? group : (blended ?? this.#groupAfter());
     if (this.#next && this.#next.group !== wanted) this.#release();
-    if (this.#opening && this.#opening.group !== wanted) this.#opening.control.abort();
-    const isUrgent = isWaiting || blended !== undefined || (!isPreview && this.#isNearEnd());
+    if (this.#opening && this.#opening.group !== wanted) {
+      this.#opening.control.abort();
+      this.#opening = null;
+    }
+    const isUrgent = isWaiting || blended !== undefined || (!isPreview && rate > 0 && this.#isNearEnd());
     if (wanted !== undefined && !this.#next && (isUrgent || this.#shown.isSettled)) this.#begin(wanted);
-    for (const scene of this.scenes) scene.setPlayhead(this.#headIn(scene.group));
+    if (isWaiting) this.#shown.rest();
+    else this.#shown.setPlayhead(this.#headIn(this.#shown.group));
+    this.#next?.setPlayhead(this.#headIn(this.#next.group));
   }
 
   /** Return what makes the picture at a time in seconds, as far as it is held. */
@@ -383,7 +388,7 @@ export class Clip extends EventTarget {
         this.#error = asKpcError(error);
       }
     }
-    this.#opening = null;
+    if (this.#opening === opening) this.#opening = null;
     this.#arrived();
   }
 }

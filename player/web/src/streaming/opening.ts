@@ -6,18 +6,15 @@ import { BudgetError, FormatError } from '../container/errors.js';
 import { KNOWN_KINDS } from '../container/scene.js';
 import type { DecoderPool } from '../decoder/pool.js';
 import type { SceneContent } from '../decoder/tasks.js';
-import { FIRST_BYTES } from './http.js';
 import type { Source } from './source.js';
 
-/** Read header and index of a file; return them with the first bytes of the file, which may hold chunks, too. */
+/** Read header and index of a file. */
 export async function openContainer(source: Source, signal?: AbortSignal): Promise<Container> {
-  let bytes = await source.read(0, FIRST_BYTES, { signal });
-  const { indexLength, fileLength } = readHeader(bytes, true);
+  const { indexLength, fileLength } = readHeader(await source.read(0, HEADER_LENGTH, { signal }), true);
   if (source.size !== null && source.size > fileLength) {
     throw new FormatError(`${source.size - fileLength} bytes follow the end of the file`);
   }
-  const needed = HEADER_LENGTH + indexLength;
-  if (bytes.length < needed) bytes = await source.read(0, needed, { signal });
+  const bytes = await source.read(0, HEADER_LENGTH + indexLength, { signal });
   return new Container(bytes, { allowPartial: true });
 }
 

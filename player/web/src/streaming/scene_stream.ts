@@ -14,7 +14,9 @@ import { needsOccupancy, type Projection } from '../decoder/segment.js';
 import type { SceneContent } from '../decoder/tasks.js';
 import { layerCount } from '../decoder/texels.js';
 import { occupancySlot } from '../render/scene_source.js';
+import { BegunSource } from './begun.js';
 import { CellDistances } from './cell_distances.js';
+import { FIRST_BYTES } from './http.js';
 import { adjacentRuns, isThere, openContainer, readContent } from './opening.js';
 import {
   fetchOrder,
@@ -85,7 +87,7 @@ export class SceneStream {
   /** Why nothing more will come; null if it will. */
   error: KpcError | null = null;
   readonly sound: SoundStream;
-  readonly #source: Source;
+  readonly #source: BegunSource;
   readonly #pool: DecoderPool;
   readonly #container: Container;
   readonly #content: SceneContent;
@@ -103,10 +105,11 @@ export class SceneStream {
   #head: Playhead = { time: 0, rate: 0, loop: true };
   #pieces: { position: number; texels: Uint16Array; takenRows: number }[] = [];
   #isStalled = true;
-  #isClosed = false;
+  readonly #ending = new AbortController();
+  #isResting = false;
 
   private constructor(
-    source: Source,
+    source: BegunSource,
     pool: DecoderPool,
     container: Container,
     content: SceneContent,
@@ -150,10 +153,16 @@ export class SceneStream {
   /** Open a scene: wait for its header, its index and all chunks but planes, which `setPlayhead` lets come. */
   static async open(source: Source, pool: DecoderPool, options: SceneStreamOptions): Promise<SceneStream> {
     const { signal } = options;
-    const container = await openContainer(source, signal);
-    const content = await readContent(source, container, pool, options.memory, signal);
-    options.check?.(content, container);
-    return new SceneStream(source, pool, container, content, options);
+    const begun = new BegunSource(source, FIRST_BYTES);
+    try {
+      const container = await openContainer(begun, signal);
+      const content = await readContent(begun, container, pool, options.memory, signal);
+      options.check?.(content, container);
+      return new SceneStream(begun, pool, container, content, options);
+    } catch (error) {
+      begun.close();
+      throw error;
+    }
   }
 
   get head(): SceneContent['head'] {
@@ -184,6 +193,7 @@ export class SceneStream {
   /** Set the position in the scene. A jump cancels requests that the picture does not wait for. */
   setPlayhead(head: Playhead): void {
     this.#head = head;
+    this.#isResting = false;
     this.distances(occupancySlot(this, head.time)); // before there are planes for workers to decode
     if (this.#exceedsMemory) {
       const fitting = segmentsToKeep(this.#segments, head, this.#segmentMemory);
@@ -203,6 +213,12 @@ export class SceneStream {
       }
     }
     this.#schedule();
+  }
+
+  /** Ask for nothing more until the next `setPlayhead`: the line is for another scene. */
+  rest(): void {
+    this.#isResting = true;
+    for (const request of this.#requests) request.control.abort();
   }
 
   /** Take finished rows of space planes, at most so many bytes or one row. */
@@ -335,15 +351,15 @@ export class SceneStream {
     const stored = Math.max(...this.#container.index.map((entry) => (entry.kind === 'PLNE' ? entry.storedLength : 0)));
     const cells = occupancy.occupied.length * (2 + 1 / occupancy.sizes[0]) + occupancy.content.length;
     const grid = motion ? 4 * motion.displacements.length * (1 + 4 / 3 / motion.sizes[0]) : 0;
-    return (
-      textureBytes(head) + cells + grid + this.sound.memoryBytes + WAITING_BYTES + largest + 2 * (RUN_BYTES + stored)
-    );
+    const coming = WAITING_BYTES + largest + FIRST_BYTES + 2 * (RUN_BYTES + stored);
+    return textureBytes(head) + cells + grid + this.sound.memoryBytes + coming;
   }
 
   /** End all requests and let go of everything. */
   close(): void {
-    this.#isClosed = true;
+    this.#ending.abort();
     this.sound.close();
+    this.#source.close();
     for (const request of this.#requests) request.control.abort();
     for (const scale of this.#timePlanes) for (const plane of Object.values(scale)) plane.clear();
     this.#pieces = [];
@@ -376,7 +392,7 @@ export class SceneStream {
 
   /** Begin the requests that there is room for. */
   #schedule(): void {
-    while (!this.#isClosed && this.error === null) {
+    while (!this.#ending.signal.aborted && !this.#isResting && this.error === null) {
       const requests = [...this.#requests];
       const remaining = requests.reduce((sum, request) => sum + request.remaining, 0);
       if (requests.length > 1 || remaining > OVERLAP_BYTES) return;
@@ -449,15 +465,17 @@ export class SceneStream {
 
   /** Decode a segment; one that came damaged is fetched a second time. */
   async #decode(position: number, body: Uint8Array<ArrayBuffer>, isSecond = false): Promise<void> {
-    const { number, isTime } = this.#segments[position];
+    const { number, isTime, scale } = this.#segments[position];
     const entry = this.#container.index[number];
     const { name, plane } = this.#planeOf(number);
     try {
       const projection = needsOccupancy(entry.codec, body) ? await this.#projection(name) : null;
       const task = { kind: 'segment', number, entry, body, plane, projection, asTexels: !isTime } as const;
       const numbers = entry.rowCount * plane.columns * plane.channels;
-      const result = await this.#pool.run(task, { numbers, moved: [body.buffer] });
-      if (this.#isClosed) return;
+      // Coarse scales first, also of those that waited for a projection.
+      const options = { numbers, rank: scale, moved: [body.buffer], signal: this.#ending.signal };
+      const result = await this.#pool.run(task, options);
+      if (this.#ending.signal.aborted) return;
       if (result instanceof Uint16Array) {
         this.#pieces.push({ position, texels: result, takenRows: 0 });
         this.#state[position] = State.Waiting;
@@ -470,7 +488,7 @@ export class SceneStream {
       this.#changed();
       this.#schedule();
     } catch (error) {
-      if (this.#isClosed) return;
+      if (this.#ending.signal.aborted) return;
       if (isSecond || !(error instanceof KpcError) || error.code !== 'damaged') return this.#fail(error);
       const { offset, storedLength } = entry;
       try {
@@ -487,14 +505,15 @@ export class SceneStream {
     if (found === undefined) {
       const { sizes, content } = this.occupancy;
       const cells: [number, number] = [sizes[axisOf(name[1])], sizes[axisOf(name[0])]];
-      found = this.#pool.run({ kind: 'project', content, plane: PLANES.indexOf(name), cells });
+      const task = { kind: 'project', content, plane: PLANES.indexOf(name), cells } as const;
+      found = this.#pool.run(task, { signal: this.#ending.signal });
       this.#projections.set(name, found);
     }
     return found;
   }
 
   #fail(error: unknown): void {
-    if (this.#isClosed || this.error !== null) return;
+    if (this.#ending.signal.aborted || this.error !== null) return;
     this.error = asKpcError(error);
     this.#changed();
   }
