@@ -8,14 +8,18 @@
 """
 
 import argparse
+import json
 import math
 import sys
+from pathlib import Path
 
+from kpc.encoder.datasets.layouts.nerfstudio import MADE_BY
 from kpc.encoder.poses.document import write_document
 from kpc.encoder.poses.find import Found, find_poses
 from kpc.encoder.poses.page import NAME, write_page
 from kpc.encoder.poses.wishes import add_pose_options, wishes_from
 from kpc.format.common import cli
+from kpc.format.common.errors import UsageError
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -27,6 +31,7 @@ def _command(argv: list[str]) -> None:
     options = _parser().parse_args(argv)
     file = options.output or options.folder / "transforms.json"
     cli.check_writable(file)
+    _refuse_other_document(file)
     found = find_poses(options.folder, wishes_from(options))
     write_document(found, options.folder, file)
     page = file.with_name(NAME)
@@ -48,10 +53,26 @@ def _parser() -> argparse.ArgumentParser:
         help="a folder of videos, of folders of frames, or of photographs",
     )
     parser.add_argument(
-        "-o", "--output", type=cli.named_path, metavar="JSON", help="default: transforms.json in the folder"
+        "-o",
+        "--output",
+        type=cli.output_file(".json"),
+        metavar="JSON",
+        help="default: transforms.json in the folder; only a document of kpposes is replaced",
     )
     add_pose_options(parser)
     return parser
+
+
+def _refuse_other_document(file: Path) -> None:
+    """Refuse to replace a document of someone else: cameras or clocks that were given."""
+    if not file.exists():
+        return
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError:
+        document = None
+    if not isinstance(document, dict) or document.get("made_by") != MADE_BY:
+        raise UsageError(f"{file}: is not a document of kpposes and stays; move it, or choose another name with -o")
 
 
 def report(found: Found) -> str:

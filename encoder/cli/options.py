@@ -106,6 +106,12 @@ class Options:
         """The most pixels along the longer side of a picture that the preset's planes can hold; None if not limited."""
         return None if self.downscale else PIXELS_PER_TEXEL * max(PRESETS[self.preset].resolutions)
 
+    @property
+    def files_read(self) -> tuple[Path, ...]:
+        """The source, and the files that --audio and --sync may name."""
+        sync = self.wishes.sync
+        return (self.source, Path(self.audio), *((sync,) if isinstance(sync, Path) else ()))
+
     def config(self, dataset: Dataset) -> TrainConfig:
         """Return the configuration of training on a dataset."""
         config = PRESETS[self.preset]
@@ -304,7 +310,7 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--keep-checkpoint",
-        type=cli.named_path,
+        type=cli.output_file(".kpck"),
         metavar="MODEL.kpck",
         help="also write the finished checkpoint there; kpenc codes it anew without training",
     )

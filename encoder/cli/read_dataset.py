@@ -9,7 +9,7 @@ from typing import Any
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.work_folder import POSES
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.datasets.loading import has_layout
+from kpc.encoder.datasets.loading import has_layout, layouts_of
 from kpc.encoder.poses.footage import find_footage
 from kpc.format.common.media_files import is_hidden, is_image, is_video
 
@@ -46,6 +46,16 @@ def read_dataset(options: Options) -> Dataset:
         most_across=options.most_across,
         transforms=transforms,
     )
+
+
+def check_folder(root: Path) -> None:
+    """Refuse a folder that holds nothing to encode.
+
+    Raises:
+        DatasetError: it has neither a layout nor footage.
+    """
+    if not _has_footage(root):
+        layouts_of(root)
 
 
 def _has_footage(root: Path) -> bool:

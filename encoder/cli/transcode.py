@@ -8,6 +8,7 @@ from typing import Any
 
 from kpc.encoder.cli.grouped import options_of_group
 from kpc.encoder.cli.options import Options
+from kpc.encoder.cli.work_folder import is_own_file
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.rdo import codec_model
 from kpc.encoder.rdo.rate_control import Trade
@@ -160,12 +161,14 @@ def check_outputs(options: Options) -> None:
     """Check before training, which may take hours, that the output files can be written.
 
     Raises:
-        UsageError, OSError: one cannot.
+        UsageError, OSError: one cannot, would replace what is read, or would be removed with the work folder.
     """
-    if options.output.exists() and options.source.is_file() and options.output.samefile(options.source):
-        raise UsageError(f"{options.output}: is the source, too; write elsewhere with -o")
-    cli.check_writable(options.output)
-    if options.keep_checkpoint is not None:
-        cli.check_writable(options.keep_checkpoint, option="--keep-checkpoint")
+    for output, option in ((options.output, "-o"), (options.keep_checkpoint, "--keep-checkpoint")):
+        if output is None:
+            continue
+        cli.check_writable(output, option=option)
+        cli.refuse_sources(output, *options.files_read, option=option)
+        if is_own_file(output, options.work_dir):
+            raise UsageError(f"{output}: is a name that kpenc uses in its work folder; choose another with {option}")
     if options.output.suffix.lower() != ".kpc":
         raise UsageError(f"{options.output}: kpenc writes .kpc files; end the name in .kpc")

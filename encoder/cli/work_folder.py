@@ -3,6 +3,7 @@
 import contextlib
 import shutil
 from collections.abc import Iterator
+from fnmatch import fnmatch
 from pathlib import Path
 
 import torch
@@ -12,6 +13,8 @@ from kpc.format.container import rewriting
 
 CHECKPOINT = "checkpoint.kpck"
 POSES = "poses"  # the folder of cameras found for footage without poses
+# The files of an encode in its work folder, but for decoded pixels.
+OWN_FILES = ("group-*.kpc", "group-*.json", "group-*.kpck", CHECKPOINT, f".{Path(CHECKPOINT).stem}.*")
 
 
 def make_work_folder(work: Path, cache: Path | None = None) -> None:
@@ -35,7 +38,7 @@ def clear_work_folder(work: Path, cache: Path | None = None) -> None:
 
     Decoded pixels stay if `cache` names a folder for them, even this one, since other encodes may use them.
     """
-    patterns = ["group-*.kpc", "group-*.json", "group-*.kpck", CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"]
+    patterns = list(OWN_FILES)
     if cache is None:
         patterns += ["pixels-*.bin", "pixels-*.json"]
         for packed in work.glob("pixels-*/"):
@@ -45,6 +48,11 @@ def clear_work_folder(work: Path, cache: Path | None = None) -> None:
             leftover.unlink(missing_ok=True)
     shutil.rmtree(work / POSES, ignore_errors=True)
     remove_if_empty(work)
+
+
+def is_own_file(path: Path, work: Path) -> bool:
+    """Return whether a file has a name that an encode uses, and then removes, in its work folder."""
+    return path.parent.resolve() == work.resolve() and any(fnmatch(path.name, own) for own in OWN_FILES)
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
@@ -105,6 +106,20 @@ def load_dataset(
 
 def _recognise(root: Path, holdout: str | None) -> Capture:
     """Read the folder as the first layout that recognises it."""
+    layouts = layouts_of(root)
+    capture = layouts[0].read(root, holdout)
+    if len(layouts) > 1:
+        others = ", ".join(layout.NAME for layout in layouts[1:])
+        print(f"{root}: read as {capture.layout}; what is there in the layout of {others} is not", file=sys.stderr)
+    return capture
+
+
+def layouts_of(root: Path) -> list[ModuleType]:
+    """Return the layouts that recognise a folder, at least one.
+
+    Raises:
+        DatasetError: none does, or there is no folder.
+    """
     if not root.is_dir():
         problem = "not a directory" if root.exists() else "no such directory"
         raise DatasetError(f"{root}: {problem}; give a folder of posed videos or images")
@@ -112,11 +127,7 @@ def _recognise(root: Path, holdout: str | None) -> Capture:
         raise DatasetError(f"{root}: empty directory; give a folder of posed videos or images")
     layouts = [layout for layout in LAYOUTS if layout.recognise(root)]
     if layouts:
-        capture = layouts[0].read(root, holdout)
-        if len(layouts) > 1:
-            others = ", ".join(layout.NAME for layout in layouts[1:])
-            print(f"{root}: read as {capture.layout}; what is there in the layout of {others} is not", file=sys.stderr)
-        return capture
+        return layouts
     raise DatasetError(
         f"{root}: no dataset layout recognised; it needs one of: poses_bounds.npy (N3DV, LLFF), transforms_train.json "
         "(Blender, D-NeRF), transforms.json (nerfstudio, instant-ngp), dataset.json (Nerfies), intri.yml and extri.yml "

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from kpc.encoder.datasets.layouts.nerfstudio import MADE_BY
 from kpc.encoder.datasets.video import read_video
 from kpc.encoder.poses.find import Found, depth_range
 from kpc.encoder.poses.instants import frame_times
@@ -26,7 +27,7 @@ def write_document(found: Found, root: Path, file: Path) -> None:
         root: the folder that names are relative to, but for the frames of a moving camera.
         file: of the document.
     """
-    document: dict[str, Any] = {"camera_model": "OPENCV", "made_by": "kpposes", "kind": found.kind}
+    document: dict[str, Any] = {"camera_model": "OPENCV", "made_by": MADE_BY, "kind": found.kind}
     if found.is_metric:
         document["unit"] = "metre"
     if found.kind == "moving camera":

@@ -166,6 +166,21 @@ def check_writable(path: Path, *, is_folder: bool = False, option: str = "-o") -
         raise OSError(errno.EACCES, f"no permission to write there; choose another place with {option}", str(path))
 
 
+def refuse_sources(output: Path, *sources: Path, option: str = "-o") -> None:
+    """Refuse an output that would replace a file that is read.
+
+    Args:
+        output: to be written.
+        sources: files, or folders, which no file can replace.
+        option: that names another output.
+
+    Raises:
+        UsageError: it is one of the sources, by whatever name.
+    """
+    if output.exists() and any(source.exists() and output.samefile(source) for source in sources):
+        raise UsageError(f"{output}: is the source, too; write elsewhere with {option}")
+
+
 def make_folder(path: Path) -> None:
     """Make a folder, and those above it, unless it is there.
 

@@ -166,6 +166,20 @@ def test_what_cannot_be_matched_is_named(tmp_path, capsys):
     assert not (tmp_path / "transforms.json").exists()
 
 
+def test_only_a_document_of_kpposes_is_replaced(tmp_path, capsys):
+    film(tmp_path / "a.mp4")
+    (tmp_path / "transforms.json").write_text('{"frames": []}')  # poses that were given
+    for output, complaint in (("a.mp4", "does not end in .json"), ("transforms.json", "and stays")):
+        before = (tmp_path / output).read_bytes()
+        try:
+            code = kpposes.main([str(tmp_path), "-o", str(tmp_path / output)])
+        except SystemExit as ended:
+            code = ended.code
+        assert code == 2 and complaint in capsys.readouterr().err and (tmp_path / output).read_bytes() == before
+    (tmp_path / "transforms.json").write_text('{"made_by": "kpposes"}')
+    assert kpposes.main([str(tmp_path), "--rig", "still"]) == 1 and "depth needs 3 or more" in capsys.readouterr().err
+
+
 def test_cameras_are_found_anew_if_what_they_depend_on_changes(tmp_path, monkeypatch, capsys):
     (tmp_path / "set").mkdir()
     for name in ("a", "b", "c"):

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -111,7 +112,7 @@ def test_a_grid_makes_a_job_of_each_combination(tmp_path: Path, take: Path) -> N
         ('output = "out"\n', "there is no scene"),
         ('output = "out"\n[[scene]]\nsource = "none"\n', "jobs.toml:3: {0}/none: no such file or folder"),
         ('output = "out"\n[[scene]]\nname = "a"\n', "jobs.toml:2: the scene has no source"),
-        ('output = "out"\n[[scene]]\nsource = "take"\nname = "a/b"\n', "jobs.toml:4: name = 'a/b'"),
+        ('output = "out"\n[[scene]]\nsource = "take"\nname = "a/b"\n', "jobs.toml:4: name = 'a/b': '/' cannot be in"),
         ('output = "out"\n[[scene]]\nsource = "take"\nsize = 1\n', "jobs.toml:4: 'size' is not known"),
         (
             'output = "out"\n[grid]\nquality = 40\n[[scene]]\nsource = "take"\n',
@@ -139,6 +140,23 @@ def test_all_faults_are_found_at_once(tmp_path: Path, take: Path) -> None:
     with pytest.raises(FaultyBatch) as error:
         jobs.read_jobs(write(tmp_path, text))
     assert len(error.value.faults) == 3
+
+
+def test_a_source_is_never_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = tmp_path / "a.kpc"
+    shutil.copyfile(SAMPLE, scene)
+    assert main([str(scene), "-o", str(tmp_path), "--", "--quality", "20"]) == 2
+    assert capsys.readouterr().err == f"kpbatch: {scene}: {scene}: is the source, too; write elsewhere with -o\n"
+    other = Job("a", "s3://place/a.kpc")  # whose result would replace the source of another job, too
+    with pytest.raises(FaultyBatch, match="is the source, too"):
+        jobs.check_results(jobs.Batch((Job("a", "s3://place/folder"), replace(other, name="b")), "s3://place"))
+    jobs.check_results(jobs.Batch((other, Job("b", str(scene))), str(tmp_path / "out")))
+
+
+def test_an_empty_folder_is_refused_before_anything_starts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    assert main([str(tmp_path / "empty"), "-o", str(tmp_path / "out")]) == 2
+    assert "empty directory" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def test_an_address_follows_content_options_and_group(take: Path) -> None:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from kpc.format.common import cli
-from kpc.format.common.errors import UsageError
+from kpc.format.common.errors import DatasetError, UsageError
 from kpc.tools.batch.toml_lines import TomlLines
 
 # Options of kpenc that a batch sets itself, or that make no sense in one.
@@ -157,6 +157,26 @@ def jobs_of_folders(folders: Sequence[str], options: Sequence[str], resources: R
     return tuple(jobs)
 
 
+def check_results(batch: Batch) -> None:
+    """Refuse results that would replace a source.
+
+    Raises:
+        FaultyBatch: they would.
+    """
+    faults, sources = Faults(), [job.source for job in batch.jobs]
+    paths = [Path(source) for source in sources if not ADDRESS.match(source)]
+    for job in batch.jobs:
+        result = f"{batch.output.rstrip('/')}/{job.name}.kpc"
+        try:
+            if not ADDRESS.match(result):
+                cli.refuse_sources(Path(result), *paths)
+            elif result in sources:
+                raise UsageError(f"{result}: is the source, too; write elsewhere with -o")
+        except UsageError as error:
+            faults.add(job.where, str(error))
+    faults.check()
+
+
 def resolve(text: str, folder: Path) -> str:
     """Return an address unchanged, and a path as an absolute one, relative to a folder."""
     return text if ADDRESS.match(text) else str((folder / text).expanduser().absolute())
@@ -192,8 +212,10 @@ def _jobs_of(
         faults.add(lines.of("source", number), f"{source}: no such file or folder")
         return
     name = scene.get("name", name_of(source))
-    if not isinstance(name, str) or not name or UNSAFE.search(name):
-        faults.add(lines.of("name", number), f"name = {name!r}: a name has letters, digits, and . _ + - only")
+    unsafe = UNSAFE.search(name) if isinstance(name, str) else None
+    if not isinstance(name, str) or not name or unsafe:
+        found = f"{unsafe.group()!r} cannot be in a name, " if unsafe else ""
+        faults.add(lines.of("name", number), f"name = {name!r}: {found}which has letters, digits, and . _ + - only")
         return
     own = _table(scene, "options", where, faults)
     resources = _resources(common["resources"] | _table(scene, "resources", where, faults), where, faults)
@@ -247,8 +269,15 @@ def _resources(given: Mapping[str, Any], where: str, faults: Faults) -> Resource
 
 
 def _check_job(job: Job, faults: Faults) -> None:
-    """Check the options by kpenc's own parser."""
+    """Check the options by kpenc's own parser, and that a folder on this machine holds something to encode."""
     from kpc.encoder.cli import options as kpenc  # loads PyTorch, which workers need not
+    from kpc.encoder.cli.read_dataset import check_folder
+
+    if not ADDRESS.match(job.source) and Path(job.source).is_dir():
+        try:
+            check_folder(Path(job.source))
+        except DatasetError as error:
+            faults.add(job.where, str(error))
 
     source = "folder" if ADDRESS.match(job.source) and not job.source.endswith(".kpc") else job.source
     if ADDRESS.match(job.source) and job.source.endswith(".kpc"):

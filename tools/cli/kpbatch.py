@@ -16,7 +16,7 @@ from pathlib import Path
 
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
-from kpc.tools.batch.jobs import Batch, FaultyBatch, Job, Resources, jobs_of_folders, read_jobs, resolve
+from kpc.tools.batch.jobs import Batch, FaultyBatch, Job, Resources, check_results, jobs_of_folders, read_jobs, resolve
 from kpc.tools.batch.store import Store
 from kpc.tools.batch.summary import SHARED, print_summary, publish, write_report
 from kpc.tools.batch.tasks import PREPARE, Outcome, done_before, first_tasks, is_last, tasks_of_groups
@@ -35,6 +35,7 @@ def _command(argv: list[str]) -> None:
     options, words = _parse(argv)
     try:
         batch = _batch(options, words)
+        check_results(batch)
     except FaultyBatch as error:
         *others, last = error.faults
         for fault in others:

@@ -49,8 +49,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _command(argv: list[str]) -> None:
     options = _parser().parse_args(cli.join_values(argv, "--box", "--move", "--up"))
-    if options.output.exists() and options.output.samefile(options.scene):
-        raise UsageError(f"{options.output}: is the input, too; choose another output with -o")
+    cli.refuse_sources(options.output, options.scene)
     cli.check_writable(options.output)
     edits, groups = _edits_from(options), Groups(options.scene)
     if groups.clip.frame_count == 1 and (edits.speed is not None or edits.fps is not None):

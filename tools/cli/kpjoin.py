@@ -47,8 +47,7 @@ def _command(argv: list[str]) -> None:
     if len(options.scenes) < 2:
         what = "is a folder" if options.scenes[0].is_dir() else "a single file cannot be joined"
         raise UsageError(f"{options.scenes[0]}: {what}; give two or more files")
-    if options.output.exists() and any(options.output.samefile(scene) for scene in options.scenes):
-        raise UsageError(f"{options.output}: is one of the inputs; choose another output with -o")
+    cli.refuse_sources(options.output, *options.scenes)
     cli.check_writable(options.output)
     with tempfile.TemporaryDirectory(dir=options.output.parent) as folder:
         parts = groups.group_inputs(options.scenes)
