@@ -53,6 +53,7 @@ def _command(argv: list[str]) -> None:
     if options.web:
         _play_in_browser(options)
         return
+    options.memory = DEFAULT_BUDGET if options.memory is None else options.memory
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames} is not positive")
     if options.screenshot is not None:
@@ -85,7 +86,7 @@ def _play_in_browser(options: argparse.Namespace) -> None:
         raise UsageError(f"--{given[0].replace('_', '-')}: is for the window; the page has its own, leave out --web")
     from kpc.player.sharing.web_view import play_in_browser
 
-    play_in_browser(Playlist.named(options.scenes).files)
+    play_in_browser(Playlist.named(options.scenes).files, options.memory)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -109,10 +110,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--memory",
         type=cli.byte_count,
-        default=DEFAULT_BUDGET,
         metavar="500MB",
         help="limit for the scene, in main memory and on the graphics card together (default: "
-        f"{DEFAULT_BUDGET / 1e9:.3g}GB)",
+        f"{DEFAULT_BUDGET / 1e9:.3g}GB; with --web, what the player in pages has)",
     )
     quality = parser.add_mutually_exclusive_group()
     quality.add_argument(

@@ -3,6 +3,7 @@
 All addresses in the pages are relative, so that the folder may lie anywhere on any static web host.
 """
 
+import hashlib
 import re
 import shutil
 from collections.abc import Mapping, Sequence
@@ -24,8 +25,9 @@ POLICY = (
     "style-src 'self' 'unsafe-inline'; connect-src 'self'$hosts"
 )
 PLAYER_FILES = ("kpc-player.js", "kpc-worker.js")
-# How pages written by this module are recognised: only they are replaced.
+# How pages written by this module are recognised: only they are replaced, and the files that they record.
 GENERATOR = '<meta name="generator" content="kpshare">'
+RECORD = '<meta name="kpshare-files" content="$files">'
 PAGE, POSTER = "index.html", "poster.jpg"
 
 
@@ -68,7 +70,9 @@ class SharedScene:
         return given or f"A scene to look at from all sides ({self.facts}): drag to turn, scroll to come closer."
 
 
-def scene_page(scene: SharedScene, *, root: str = "", url: str | None = None, hosts: str = "") -> str:
+def scene_page(
+    scene: SharedScene, *, root: str = "", url: str | None = None, hosts: str = "", memory: int | None = None
+) -> str:
     """Return the page of a scene.
 
     Args:
@@ -76,6 +80,7 @@ def scene_page(scene: SharedScene, *, root: str = "", url: str | None = None, ho
         root: where the player and the style sheet lie, relative to the page; the gallery, too, if it is not empty.
         url: where the page will be published, for link previews, which need whole addresses; None if it is not known.
         hosts: what else the page may load from, for the Content-Security-Policy.
+        memory: the memory budget of the player, bytes; None for its own.
     """
     about = [f"<p>{escape(scene.description)}</p>"]
     document = scene.metadata.document
@@ -86,6 +91,7 @@ def scene_page(scene: SharedScene, *, root: str = "", url: str | None = None, ho
         title=escape(scene.title),
         scene=escape(scene.address),
         poster=f' poster="{POSTER}"' if scene.has_poster else "",
+        memory="" if memory is None else f' memory="{memory}"',
         about="\n".join(about),
         back=f'<p><a href="{root}{PAGE}">All scenes</a></p>' if root else "",
     )
@@ -123,33 +129,69 @@ def embed_snippet(scene: SharedScene, root: str = "", url: str | None = None) ->
     )
 
 
+def player_files() -> dict[str, bytes]:
+    """Return the player and the style sheet of the pages, by their names beside the pages."""
+    built = files("kpc.player") / "web" / "dist"
+    found = {name: (built / name).read_bytes() for name in PLAYER_FILES}
+    return found | {"page.css": (files(__package__) / "page.css").read_bytes()}
+
+
 def copy_player(folder: Path) -> None:
     """Put the player and the style sheet of the pages into a folder."""
-    built = files("kpc.player") / "web" / "dist"
-    for name in PLAYER_FILES:
-        write_file(folder / name, (built / name).read_bytes())
-    write_file(folder / "page.css", (files(__package__) / "page.css").read_bytes())
+    for name, content in player_files().items():
+        write_file(folder / name, content)
 
 
-def check_folder(folder: Path, scenes: Mapping[str, Path]) -> None:
+def check_folder(folder: Path, wanted: Mapping[str, Path | bytes]) -> None:
     """Refuse a folder in which what this module did not write would be replaced.
 
     Args:
         folder: that is to be written.
-        scenes: the files that are copied into it, by their names there. Others of these names are taken for earlier
-            ones where the folder has a page of this module.
+        wanted: what is to be written beside its page, by names. Files of these names may be there already if they are
+            equal, or as the page of the folder records that they were written.
 
     Raises:
         UsageError: a page or a file would be replaced.
     """
-    page = folder / PAGE
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder}: is a file, not a folder, and stays; choose another folder with -o")
+    page, text = folder / PAGE, ""
     if page.exists():
-        if GENERATOR not in page.read_text(errors="replace"):
+        text = page.read_text(errors="replace") if page.is_file() else ""
+        if GENERATOR not in text:
             raise UsageError(f"{page}: is not a page of kpshare and stays; choose another folder with -o")
-        return
-    for name, source in scenes.items():
-        if (folder / name).exists() and not (source.exists() and (folder / name).samefile(source)):
-            raise UsageError(f"{folder / name}: is another file, and stays; choose another folder with -o")
+    written = _recorded(text)
+    for name, content in wanted.items():
+        path = folder / name
+        if path.exists() and not (path.is_file() and _checksum(path) in (written.get(name), _checksum(content))):
+            raise UsageError(f"{path}: is another file, and stays; choose another folder with -o")
+
+
+def with_record(page: str, written: Mapping[str, Path | bytes]) -> str:
+    """Return a page that records what was written beside it, so that only this is replaced later.
+
+    Args:
+        page: markup of a page of this module.
+        written: the files, by their names, which are those of `file_name`.
+    """
+    listed = " ".join(f"{name}={_checksum(content)}" for name, content in written.items())
+    return page.replace(GENERATOR, GENERATOR + "\n" + Template(RECORD).substitute(files=listed), 1)
+
+
+def _recorded(page: str) -> dict[str, str]:
+    """Return the checksums of files by their names that a page records."""
+    before, _, after = RECORD.partition("$files")
+    found = re.search(f'{re.escape(before)}([^"]*){re.escape(after)}', page)
+    pairs = [] if found is None else [pair.partition("=") for pair in found[1].split()]
+    return {name: checksum for name, _, checksum in pairs}
+
+
+def _checksum(content: Path | bytes) -> str:
+    """Return the SHA-256 of a file or of bytes, in hexadecimal digits."""
+    if isinstance(content, bytes):
+        return hashlib.sha256(content).hexdigest()
+    with content.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_file(path: Path, content: str | bytes) -> None:

@@ -1,5 +1,6 @@
 """Playing scenes in the browser of this machine."""
 
+import sys
 import tempfile
 import threading
 import webbrowser
@@ -9,7 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 from urllib.parse import urlsplit
 
-from kpc.format.common.errors import UsageError
+from kpc.format.common.cli import message_of
+from kpc.format.common.errors import KpcError, UsageError
+from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.groups import Groups
 from kpc.format.container.http_address import is_url
 from kpc.player.sharing import site
@@ -32,47 +35,72 @@ class _Handler(Handler):
         return super().translate_path(path) if found is None else str(found)
 
 
-def play_in_browser(files: Sequence[str]) -> None:
+def play_in_browser(files: Sequence[str], memory: int | None = None) -> None:
     """Serve a page that plays scenes, open it in the browser, and go on serving until Ctrl-C.
 
     Args:
-        files: paths and addresses of .kpc files; several are listed by a gallery.
+        files: paths and addresses of .kpc files; several are listed by a gallery, without those that cannot be read,
+            for each of which a line is printed. Of a file that is cut off, what is there is played.
+        memory: the memory budget of the player, bytes; None for its own.
 
     Raises:
-        OSError, FormatError, NetworkError: a file cannot be read.
+        OSError, FormatError, NetworkError, BudgetError: no file can be read.
         UsageError: an address has a user and password.
     """
-    with serving_pages(files) as url:
+    with serving_pages(files, memory) as url:
         is_open = webbrowser.open(url)
         print(f"{url} {'is open in' if is_open else 'opens in'} a browser; Ctrl-C ends the server", flush=True)
         threading.Event().wait()
 
 
 @contextmanager
-def serving_pages(files: Sequence[str]) -> "Iterator[str]":
-    """Serve pages that play scenes to this machine while the context lasts.
+def serving_pages(files: Sequence[str], memory: int | None = None) -> "Iterator[str]":
+    """Serve pages that play scenes to this machine while the context lasts; the arguments are `play_in_browser`'s.
 
     Yields:
         The URL of the first page.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kpplay-")))
-        elsewhere = _write_pages(files, folder)
+        elsewhere = _write_pages(files, folder, memory)
         handler = type("_Pages", (_Handler,), {"elsewhere": elsewhere})
         yield stack.enter_context(serving(folder, handler=handler)) + "/"
 
 
-def _write_pages(files: Sequence[str], folder: Path) -> dict[str, Path]:
+def _opened(files: Sequence[str], budget: int) -> list[tuple[str, Groups]]:
+    """Open the files that can be read, and print a line about each that cannot, or whose end is missing.
+
+    Raises:
+        KpcError, OSError: none can be read; why the last one cannot.
+    """
+    found: list[tuple[str, Groups]] = []
+    for number, file in enumerate(files):
+        try:
+            groups = Groups(file, memory_budget=budget, allow_partial=True)
+            groups.metadata()
+        except (KpcError, OSError) as error:
+            if not found and number + 1 == len(files):
+                raise
+            print(f"kpplay: {message_of(error) or error}; left out", file=sys.stderr)
+            continue
+        found.append((file, groups))
+        if groups.reader.cut_off is not None:
+            print(f"kpplay: {groups.reader.cut_off}; what is there is played", file=sys.stderr)
+    return found
+
+
+def _write_pages(files: Sequence[str], folder: Path, memory: int | None) -> dict[str, Path]:
     """Write a page for each scene and, for several, a gallery; return where the files are that the pages name."""
     if any(is_url(file) and "@" in urlsplit(file).netloc for file in files):
         raise UsageError("--web: browsers take no user and password in the address of a file; play it without --web")
+    opened = _opened(files, DEFAULT_BUDGET if memory is None else memory)
+    files = [file for file, _ in opened]
     site.copy_player(folder)
     elsewhere: dict[str, Path] = {}
     names = site.distinct_names([Path(urlsplit(file).path if is_url(file) else file).stem for file in files])
     is_gallery = len(files) > 1
     scenes = {}
-    for file, name in zip(files, names, strict=True):
-        groups = Groups(file)
+    for (file, groups), name in zip(opened, names, strict=True):
         prefix = f"{name}/" if is_gallery else ""
         address, hosts = f"{name}.kpc", ""
         if is_url(file):
@@ -81,7 +109,7 @@ def _write_pages(files: Sequence[str], folder: Path) -> dict[str, Path]:
             elsewhere[f"/{prefix}{address}"] = Path(file).absolute()
         scene = SharedScene(address, name, groups.metadata(), groups.clip, sum(groups.size_bytes), has_poster=False)
         (folder / prefix).mkdir(exist_ok=True)
-        page = site.scene_page(scene, root="../" if is_gallery else "", hosts=hosts)
+        page = site.scene_page(scene, root="../" if is_gallery else "", hosts=hosts, memory=memory)
         site.write_file(folder / prefix / site.PAGE, page)
         scenes[name] = scene
     if is_gallery:

@@ -1,5 +1,6 @@
 """Pages that play scenes: those of kpshare, and those of kpplay --web."""
 
+import hashlib
 import re
 import shutil
 import urllib.request
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from kpc.format.common.errors import FormatError
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Clip
 from kpc.player.app import kpplay
@@ -148,6 +150,26 @@ def test_another_file_of_the_name_of_the_scene_stays(tmp_path: Path, capsys: pyt
     assert [path.name for path in tmp_path.iterdir()] == [SAMPLE.name]
 
 
+@pytest.mark.parametrize("name", ["poster.jpg", "page.css", "default.kpc", "kpc-player.js"])
+def test_files_of_someone_else_stay_and_own_ones_are_replaced(
+    tmp_path: Path, quick_posters: None, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    command = [str(SAMPLE), "-o", str(tmp_path)]
+    (tmp_path / name).write_text("mine")
+    assert kpshare.main(command) == 2 and f"{name}: is another file, and stays" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "mine"
+    (tmp_path / name).unlink()
+    assert kpshare.main(command) == 0
+    page = tmp_path / "index.html"
+    checksum = hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
+    older = page.read_text().replace(checksum, hashlib.sha256(b"older").hexdigest())
+    page.write_text(older)
+    (tmp_path / name).write_text("older")
+    assert kpshare.main(command) == 0 and (tmp_path / name).read_bytes() != b"older", "its own file is replaced"
+    (tmp_path / name).write_text("mine")
+    assert kpshare.main(command) == 2 and (tmp_path / name).read_text() == "mine", "but not what was put in its place"
+
+
 def test_what_is_no_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.kpc").write_bytes(b"no scene")
     assert kpshare.main([str(tmp_path / "a.kpc"), "-o", str(tmp_path / "site")]) == 1
@@ -170,6 +192,23 @@ def test_a_browser_gets_page_player_and_scene(tmp_path: Path) -> None:
         assert "javascript" in types["kpc-player.js"] and "text/css" in types["page.css"]
         part, headers = read(url + "a-b.kpc", Range="bytes=4-9")
         assert part == SAMPLE.read_bytes()[4:10] and headers["content-range"] == f"bytes 4-9/{SAMPLE.stat().st_size}"
+
+
+def test_a_folder_is_played_without_what_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole, cut, foreign = tmp_path / "a.kpc", tmp_path / "b.kpc", tmp_path / "c.kpc"
+    shutil.copy(SAMPLE, whole)
+    cut.write_bytes(SAMPLE.read_bytes()[:30_000])
+    foreign.write_bytes(b"no scene")
+    with serving_pages([str(path) for path in (whole, cut, foreign)], memory=300_000_000) as url:
+        addresses = Page(read(url)[0].decode()).addresses()
+        assert [address for address in addresses if address.endswith("index.html")] == ["a/index.html", "b/index.html"]
+        assert ("kpc-player", "memory", "300000000") in Page(read(url + "b/")[0].decode()).attributes
+        assert len(read(url + "b/b.kpc")[0]) == 30_000
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 2 and "cut off at 30,000 of" in said[0] and said[0].endswith("what is there is played")
+    assert said[1].startswith(f"kpplay: {foreign}: ") and said[1].endswith("; left out")
+    with pytest.raises(FormatError), serving_pages([str(foreign)]):
+        pass
 
 
 def test_a_scene_elsewhere_may_be_loaded_from_there_alone(tmp_path: Path) -> None:

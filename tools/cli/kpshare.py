@@ -42,27 +42,34 @@ def _command(argv: list[str]) -> None:
     cli.check_writable(folder, is_folder=True)
     names = site.distinct_names([file.stem for file in files])
     folders = [folder / name if is_gallery else folder for name in names]
+    player = site.player_files()
+    at_page = {} if is_gallery else player  # those of a gallery lie above its pages
     if is_gallery:
-        site.check_folder(folder, {})
-    for file, name, place in zip(files, names, folders, strict=True):
-        site.check_folder(place, {f"{name}.kpc": file})
+        site.check_folder(folder, player)
+    beside: list[dict[str, Path]] = [{f"{name}.kpc": file} for file, name in zip(files, names, strict=True)]
+    for place, wanted in zip(folders, beside, strict=True):
+        site.check_folder(place, {**at_page, **wanted})
     root = "../" if is_gallery else ""
     with tempfile.TemporaryDirectory() as aside:
-        # Nothing is written into the folder if one of the scenes cannot be read.
+        # Nothing is written into the folder if one of the scenes cannot be read, or a poster would replace another.
         posters = [Path(aside) / f"{name}.jpg" for name in names]
         inputs = progress(list(zip(files, names, posters, strict=True)), "kpshare", unit="scenes")
         scenes = {name: _read(file, name, poster) for file, name, poster in inputs}
+        for place, wanted, poster in zip(folders, beside, posters, strict=True):
+            wanted[site.POSTER] = poster
+            site.check_folder(place, {**at_page, **wanted})
         folder.mkdir(parents=True, exist_ok=True)
         site.copy_player(folder)
-        for file, (name, scene), poster, place in zip(files, scenes.items(), posters, folders, strict=True):
+        for (name, scene), place, wanted in zip(scenes.items(), folders, beside, strict=True):
             place.mkdir(exist_ok=True)
-            site.copy_file(file, place / scene.address)
-            site.copy_file(poster, place / site.POSTER)
+            for beside_name, source in wanted.items():
+                site.copy_file(source, place / beside_name)
             url = None if options.url is None else urljoin(options.url, f"{name}/" if is_gallery else "")
-            site.write_file(place / site.PAGE, site.scene_page(scene, root=root, url=url))
+            page = site.scene_page(scene, root=root, url=url)
+            site.write_file(place / site.PAGE, site.with_record(page, {**at_page, **wanted}))
     if is_gallery:
         title = options.title or (options.gallery or folder).absolute().name
-        site.write_file(folder / site.PAGE, site.gallery_page(scenes, title, options.url))
+        site.write_file(folder / site.PAGE, site.with_record(site.gallery_page(scenes, title, options.url), player))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     print(
         f"{folder / site.PAGE}: {len(files)} scene{'s' * (len(files) != 1)}, {size:,} bytes; put {folder} on a web host"
