@@ -13,6 +13,9 @@ from kpc.player.app.state import PlayerState
 FINISH_TIMEOUT_S = 60.0
 # Frames of a camera path after which the time that is left is shown.
 MIN_TIMED_FRAMES = 3
+# Frames of the window without one of the camera path, which may take seconds: ImGui shows a new panel, with the button
+# that ends the video, in its second frame.
+FRAMES_BEFORE_PATH = 2
 
 
 class Filming:
@@ -25,7 +28,7 @@ class Filming:
     def __init__(self, state: PlayerState, scene_view: SceneView, files: OutputFiles) -> None:
         self.state, self.scene_view, self.files = state, scene_view, files
         self.recording: Recording | None = None
-        self._along_path, self._started_at = False, 0.0
+        self._along_path, self._started_at, self._waits = False, 0.0, 0
 
     @property
     def is_along_path(self) -> bool:
@@ -74,6 +77,7 @@ class Filming:
             self.recording = Recording(self.files.next_path(".mp4"), FILM_FPS, self.scene_view.canvas.size)
             self._along_path, self._started_at = along_path, clock.monotonic()
             if along_path:
+                self._waits = FRAMES_BEFORE_PATH
                 follower.start(from_beginning=True)
                 self.state.playback.playing = False
 
@@ -87,6 +91,8 @@ class Filming:
         if recording is None:
             return
         if recording.is_over:
+            if not recording.is_ending:  # it has failed: the camera stays where it is
+                self.stop()
             self.recording = None
             if recording.failure is None:
                 self.state.notify(_saved(recording))
@@ -96,7 +102,9 @@ class Filming:
             return
         elif recording.size != self.scene_view.canvas.size:
             self.state.notify("the window was resized: the video ends here")
-            recording.end()
+            self.stop()
+        elif self._along_path and self._waits:
+            self._waits -= 1
         elif self._along_path:
             self._record_path(recording)
             follower.is_active = follower.is_active and not recording.is_ending

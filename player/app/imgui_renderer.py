@@ -5,6 +5,7 @@ import ctypes
 import moderngl
 
 from kpc.player.app.desktop import imgui
+from kpc.player.app.fonts import system_font
 from kpc.player.app.widgets import ACCENT, ROOM_EM
 from kpc.player.gl import shader
 
@@ -55,6 +56,10 @@ class ImGuiRenderer:
         imgui.get_platform_io().renderer_texture_max_height = max_side
         imgui.get_style().font_scale_main = VECTOR_FONT_SCALE  # which default font is added depends on it
         self._font = self.io.fonts.add_font_default()
+        if (more := system_font()) is not None:  # for characters that the default font lacks
+            merged = imgui.FontConfig()
+            merged.merge_mode = True
+            self.io.fonts.add_font_from_memory_ttf(more, font_cfg=merged)
         self._scale = 1.0
         _set_colours()
         _set_sizes(self._scale)

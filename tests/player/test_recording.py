@@ -1,14 +1,20 @@
 """Videos that are being written: their frames, and that no call blocks."""
 
+import contextlib
 import time as clock
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from kpc.encoder.datasets.video import read_video
+from kpc.format.scene.rig import Rig
 from kpc.player.app import recording
+from kpc.player.app.filming import Filming
+from kpc.player.app.path_follower import PathFollower
 from kpc.player.app.recording import Recording, frames_due
+from scenes import tiny_scene
 
 
 def wait_for(video: Recording, seconds: float = 20.0) -> None:
@@ -71,6 +77,32 @@ def test_a_video_without_frames_is_reported(tmp_path: Path) -> None:
     video.end()
     wait_for(video)
     assert "no frames" in str(video.failure)
+
+
+def test_the_camera_stays_where_a_film_of_its_path_fails(tmp_path: Path) -> None:
+    """Before the first frame, which may take seconds, the window can show how to stop."""
+    scene, follower, notices = tiny_scene(3), PathFollower(), []
+    for time in (0.0, 1.0):
+        follower.append(scene.cameras[0], time, playing=False)
+    state = SimpleNamespace(
+        follower=follower,
+        playback=SimpleNamespace(playing=True, time=0.0),
+        rig=Rig.of(scene),
+        stream=SimpleNamespace(is_settled=True),
+        notify_error=notices.append,
+        reporting_errors=lambda folder: contextlib.nullcontext(),
+    )
+    view = SimpleNamespace(canvas=SimpleNamespace(size=(40, 30)), draw_still=lambda: None, pixels=lambda: frame(9))
+    files = SimpleNamespace(folder=tmp_path, next_path=lambda suffix: tmp_path / "nowhere" / f"a{suffix}")
+    filming = Filming(state, view, files)
+    filming.start_or_stop(along_path=True)
+    video = filming.recording
+    for taken in (0, 0, 1):
+        filming.update(0.0)
+        assert video.taken == taken and follower.is_active
+    wait_for(video)
+    filming.update(0.0)
+    assert not follower.is_active and filming.recording is None and "nowhere" in notices[0]
 
 
 @pytest.mark.parametrize("frame_s", [1 / 200, 1 / 60, 1 / 30, 1 / 7])
