@@ -1,6 +1,7 @@
 """Options of kpenc, and their command line."""
 
 import argparse
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -323,7 +324,7 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--only",
-        type=_non_negative,
+        type=cli.whole_number,
         metavar="N",
         help="with --group: code only group N, counted from 0; kpjoin joins groups to a clip",
     )
@@ -359,14 +360,14 @@ def _add_coding_options(parser: argparse.ArgumentParser) -> None:
     )
     trade.add_argument(
         "--psnr",
-        type=cli.decibels,
+        type=cli.psnr_db,
         metavar="30dB",
         help="the smallest file of at least this PSNR on training views",
     )
     tune_steps = ", ".join(f"{name} {config.tune_steps}" for name, config in sorted(PRESETS.items()))
     parser.add_argument(
         "--tune-steps",
-        type=_non_negative,
+        type=cli.whole_number,
         metavar="N",
         help="steps of fine-tuning after each group of planes is coded, in which the others learn to compensate its "
         "errors: files are about a tenth smaller, and take a minute or two longer (default, by preset: "
@@ -389,6 +390,8 @@ def _check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         parser.error("--keep-checkpoint holds a single scene; with --group give --only N, too")
     if given.audio == "none" and given.audio_bitrate is not None:
         parser.error("--audio none leaves the sound out; drop --audio-bitrate")
+    if given.steps is not None and given.time_budget is not None:
+        parser.error("--steps and --time-budget both say how long to train; drop one")
     if given.dry_run and given.resume:
         parser.error("--dry-run estimates a whole run; drop --resume")
 
@@ -431,10 +434,7 @@ def _options_from(given: argparse.Namespace) -> Options:
 
 
 def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
-    return value
+    return cli.whole_number(text, 1)
 
 
 def _downscale(text: str) -> int | None:
@@ -446,12 +446,6 @@ def test_views(text: str) -> int:
     return ALL_VIEWS if text == "all" else _positive(text)
 
 
-def _non_negative(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 on")
-    return int(text)
-
-
 def _quality(text: str) -> float:
     return cli.number_within(text, 1, 100)
 
@@ -461,15 +455,13 @@ def _lam(text: str) -> float:
 
 
 def _bitrate(text: str) -> int:
+    low, high = BITRATES
     number = text.lower().removesuffix("k")
-    value = int(number) * (1000 if number != text.lower() else 1)
-    if not BITRATES[0] <= value <= BITRATES[1]:
-        raise argparse.ArgumentTypeError(f"{text} is not between {BITRATES[0] // 1000}k and {BITRATES[1] // 1000}k")
+    value = int(number) * (1000 if number != text.lower() else 1) if re.fullmatch("[0-9]{1,6}", number) else 0
+    if not low <= value <= high:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a bitrate from {low // 1000}k to {high // 1000}k")
     return value
 
 
 def _seed(text: str) -> int:
-    value = int(text)
-    if not 0 <= value < 1 << 63:
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 0 to 2^63 - 1")
-    return value
+    return cli.whole_number(text, 0, (1 << 63) - 1)

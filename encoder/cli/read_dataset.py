@@ -11,6 +11,7 @@ from kpc.encoder.cli.work_folder import POSES
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.datasets.loading import has_layout, layouts_of
 from kpc.encoder.poses.footage import find_footage
+from kpc.format.common.errors import UsageError
 from kpc.format.common.media_files import is_hidden, is_image, is_video
 
 # The file beside found cameras that says what they were found from.
@@ -27,7 +28,9 @@ def read_dataset(options: Options) -> Dataset:
 
     Raises:
         DatasetError, MediaError: the dataset cannot be used, or its cameras cannot be found.
+        UsageError: options about cameras are given, and so are the cameras.
     """
+    _refuse_unused(options)
     root, transforms = options.source, None
     if not has_layout(root) and _has_footage(root):
         file = options.work_dir / POSES / "transforms.json"
@@ -48,14 +51,22 @@ def read_dataset(options: Options) -> Dataset:
     )
 
 
-def check_folder(root: Path) -> None:
-    """Refuse a folder that holds nothing to encode.
+def check_folder(options: Options) -> None:
+    """Refuse a folder that holds nothing to encode, or options that do not apply to it.
 
     Raises:
         DatasetError: it has neither a layout nor footage.
+        UsageError: as for `read_dataset`.
     """
-    if not _has_footage(root):
-        layouts_of(root)
+    if not _has_footage(options.source):
+        layouts_of(options.source)
+    _refuse_unused(options)
+
+
+def _refuse_unused(options: Options) -> None:
+    """Refuse options about footage without poses, of which a folder with poses would use none."""
+    if (given := options.wishes.options_given()) and has_layout(options.source):
+        raise UsageError(f"{', '.join(given)}: {options.source} has poses, so none are looked for; drop what is unused")
 
 
 def _has_footage(root: Path) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from kpc.encoder.cli.estimate import Estimate
 from kpc.encoder.cli.options import Options
-from kpc.encoder.cli.transcode import describe_outcome
+from kpc.encoder.cli.transcode import describe_copy, describe_outcome
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows
@@ -135,6 +135,8 @@ def print_result(result: dict[str, Any], options: Options, as_json: bool) -> Non
     """Print the result of an encode, or of a transcode where the source is a file."""
     if as_json:
         print_json(result)
+    elif result.get("is_copy"):
+        print(f"{options.output}: {describe_copy(result)}")
     elif options.source.is_file():
         rate = f"{result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}"
         print(f"{options.output}: {rate}; {describe_outcome(result)}")

@@ -53,11 +53,12 @@ def transcode(options: Options) -> dict[str, Any]:
     )
     coded = codec_model.code(source, options.trade, TrainConfig().prune_share, _tune_steps(options))
     data = coded.data
-    if coded.scene is source.coded:  # nothing was coded anew, and what was measured of the file holds
-        data = with_metadata(data, before.with_members(**options.members))
+    is_copy = coded.scene is source.coded
+    if is_copy:
+        data = with_metadata(min(options.source.read_bytes(), data, key=len), _with_members(before, options))
     size = rewriting.save(data, options.output)
     return {
-        "file": str(options.output), "source": str(options.source),
+        "file": str(options.output), "source": str(options.source), "is_copy": is_copy,
         **coding_figures(coded, size, options.trade, EVALUATED_ON[is_coded]),
         "encode_s": time.monotonic() - started,
     }  # fmt: skip
@@ -67,8 +68,13 @@ def _with_history(metadata: Metadata, options: Options) -> Metadata:
     """Return the metadata of what is coded anew: figures that were measured do not hold any more."""
     name, value = options.trade.bound
     history = [*metadata.provenance.get("history", []), f"coded anew by kpc {VERSION}: {name} {value:g}"]
+    changed = _with_members(metadata, options)
+    return changed.with_provenance(held_out=None, coding_loss_db=None, history=history[-HISTORY_LIMIT:])
+
+
+def _with_members(metadata: Metadata, options: Options) -> Metadata:
+    """Return the metadata of a copy, of which all figures that were measured hold, with what the options change."""
     changed = metadata.with_members(**options.members)
-    changed = changed.with_provenance(held_out=None, coding_loss_db=None, history=history[-HISTORY_LIMIT:])
     return changed if options.view_limits is None else with_view_limits(changed, options.view_limits)
 
 
@@ -78,7 +84,7 @@ def _tune_steps(options: Options) -> int:
 
 def _transcode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
     """Code each group on its own. All coded groups are in memory together."""
-    spans, parts, found = source.timeline.spans, [], []
+    spans, parts, found, is_copy = source.timeline.spans, [], [], True
     clip = _with_history(source.metadata(), options)
     trades = [options_of_group(options, number, spans).trade for number in range(len(spans))]
     if options.trade.target_bytes is not None:  # a size that is too small for a late group is refused at once, too
@@ -91,12 +97,18 @@ def _transcode_groups(options: Options, source: groups.Groups) -> dict[str, Any]
         print(f"group {number} of {len(spans)}", file=sys.stderr, flush=True)
         model = replace(codec_model.model_from_file(scene), shown=True)
         coded = codec_model.code(model, trade, TrainConfig().prune_share, _tune_steps(options))
+        is_copy = is_copy and coded.scene is model.coded
         parts.append(groups.GroupInput.of(coded.data, span.start))
         found.append(coding_figures(coded, coded.size_bytes, trade, EVALUATED_ON[1]))
-    size = groups.write(parts, options.output, clip)
+    if is_copy:
+        data = with_metadata(options.source, _with_members(source.metadata(), options))
+        size = rewriting.save(data, options.output)
+    else:
+        size = groups.write(parts, options.output, clip)
     return {
         "file": str(options.output),
         "source": str(options.source),
+        "is_copy": is_copy,
         **combine_figures(found, spans, size, options.trade),
     }
 
@@ -139,21 +151,35 @@ def coding_figures(coded: codec_model.CodedModel, size: int, trade: Trade, evalu
     }
 
 
-def describe_outcome(result: dict[str, Any]) -> str:
-    """Describe the target, and what was reached, in words."""
+def describe_target(result: dict[str, Any]) -> str:
+    """Describe the target in words."""
     name, bound = result["trade"], result["target"]
-    target = {
+    return {
         "max_loss_db": f"at most {bound:g} dB of loss",
         "target_bytes": f"at most {bound:,.0f} bytes",
         "quality": f"quality {bound:g}",
         "lam": f"lam {bound:g}",
         "psnr_db": f"at least {bound:g} dB",
     }[name]
+
+
+def describe_outcome(result: dict[str, Any]) -> str:
+    """Describe the target, and what was reached, in words."""
     loss = f"{result['validation_loss_db']:.3f} dB of loss on {result['evaluated_on']}"
-    psnr = f"{result['validation_psnr']:.2f} dB, " if name == "psnr_db" else ""
+    psnr = f"{result['validation_psnr']:.2f} dB, " if result["trade"] == "psnr_db" else ""
     return (
-        f"asked for {target}; reached {result['size_bytes']:,} bytes, {psnr}{loss}, "
+        f"asked for {describe_target(result)}; reached {result['size_bytes']:,} bytes, {psnr}{loss}, "
         f"{result['agreement_db']:.1f} dB against the uncoded pictures"
+    )
+
+
+def describe_copy(result: dict[str, Any]) -> str:
+    """Say why the result is a copy of the source."""
+    name = result["trade"]
+    why = {"target_bytes": "it is small enough", "lam": "no file of less cost was found"}
+    return (
+        f"{result['size_bytes']:,} bytes, a copy of the source, since {why.get(name, 'no smaller file was found')} "
+        f"(asked for {describe_target(result)})"
     )
 
 

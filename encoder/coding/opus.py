@@ -21,14 +21,15 @@ def encode_sound(samples: np.ndarray, bitrate: int | None = None) -> Sound:
 
     Args:
         samples: (N, 1 or 2) float32 at SAMPLE_RATE, full scale 1; N is at least 1.
-        bitrate: bits per second, on the average; None for the default of the number of channels.
+        bitrate: bits per second, which constrained VBR exceeds by 3 % at most, but for the first packets; None for the
+            default of the number of channels. Silence takes less.
     """
     count, channels = samples.shape
     layout = "mono" if channels == 1 else "stereo"
     codec = av.CodecContext.create("libopus", "w")
     codec.sample_rate, codec.layout, codec.format = SAMPLE_RATE, layout, "flt"  # type: ignore[attr-defined]
     codec.bit_rate = bitrate or DEFAULT_BITRATES[channels]
-    codec.options = {"application": "lowdelay", "frame_duration": "20"}
+    codec.options = {"application": "lowdelay", "frame_duration": "20", "vbr": "constrained"}
     codec.open()
     pre_skip = int.from_bytes(bytes(codec.extradata or b"")[10:12], "little")  # of the OpusHead of RFC 7845
     packets: list[bytes] = []

@@ -22,6 +22,7 @@ import numpy as np
 
 from kpc.format.common.cli import NO_ROOM, atomic_write
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import byte_text
 
 # Part of every fingerprint: caches of another version are rebuilt.
 CACHE_VERSION = 4
@@ -274,7 +275,7 @@ def require_room(folder: Path, size_bytes: int) -> None:
 
 def disk_full(folder: Path, size_bytes: int) -> DatasetError:
     return DatasetError(
-        f"{folder}: the disk is full: decoded pictures need {size_bytes / 1e9:.1f} GB; free some space, name a folder "
+        f"{folder}: the disk is full: decoded pictures need {byte_text(size_bytes)}; free some space, name a folder "
         "on another disk with --cache, or give --downscale 2"
     )
 

@@ -2,8 +2,10 @@
 
 import argparse
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+
+from kpc.format.common.text import option_name
 
 RIGS = ("auto", "still", "moving")
 SYNC_MODES = ("auto", "audio", "motion", "none")
@@ -30,6 +32,10 @@ class Wishes:
         distance = None if self.distance is None else "{},{}={:g}".format(*self.distance)
         given = {"rig": self.rig, "sync": str(self.sync), "distance": distance}
         return {name: value for name, value in given.items() if value not in ("auto", None)}
+
+    def options_given(self) -> list[str]:
+        """Return the options that say something else than the defaults."""
+        return [option_name(one.name) for one in fields(self) if getattr(self, one.name) != one.default]
 
 
 def add_pose_options(parser: argparse.ArgumentParser) -> None:

@@ -328,7 +328,13 @@ def code(
         )
     if model.coded is not None:
         unchanged = Attempt(model.coded, coder.measure, 0.0)
-        if unchanged.size_bytes <= found.size_bytes:
+
+        def spent(one: Attempt) -> float:
+            if trade.lam is None:
+                return one.size_bytes
+            return one.cost(trade.lam, model.scene.parameter_count)  # of the same number, whatever was pruned
+
+        if spent(unchanged) <= spent(found):
             found, pruned = unchanged, None
     measured: Fidelity = found.measured
     loss_db = coder.uncoded_psnr - measured.psnr

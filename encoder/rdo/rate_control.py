@@ -178,9 +178,9 @@ class Attempt:
     def measured(self) -> Fidelity:
         return self.measure(self.quantised.dequantise())
 
-    def cost(self, lam: float) -> float:
-        """Return the Lagrangian cost J = D + lambda R."""
-        return self.measured.mse + lam * 8 * self.size_bytes / self.quantised.parameter_count
+    def cost(self, lam: float, parameters: int | None = None) -> float:
+        """Return the Lagrangian cost J = D + lambda R, R in bits for each of `parameters`, by default the scene's."""
+        return self.measured.mse + lam * 8 * self.size_bytes / (parameters or self.quantised.parameter_count)
 
 
 def significance(diagonal: PerPlane) -> list[dict[str, np.ndarray]]:

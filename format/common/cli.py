@@ -267,14 +267,31 @@ def number_within(text: str, low: float, high: float, name: str = "a number") ->
     return value
 
 
+def whole_number(text: str, low: int = 0, high: int | None = None) -> int:
+    """Parse a whole number from `low` to `high`, if there is a largest."""
+    most, end = (math.inf, "on") if high is None else (high, f"to {high}")
+    if not (text.isascii() and text.isdecimal()) or len(text) > 20 or not low <= int(text) <= most:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {low} {end}")
+    return int(text)
+
+
 def decibels(text: str) -> float:
     """Parse a quality loss such as "0.1" or "0.1dB" into decibels."""
+    return _decibels(text, "a loss of quality; write for example 0.1dB")
+
+
+def psnr_db(text: str) -> float:
+    """Parse a PSNR such as "33" or "33dB" into decibels."""
+    return _decibels(text, "a PSNR; write for example 33dB")
+
+
+def _decibels(text: str, what: str) -> float:
     try:
         value = float(text.lower().removesuffix("db"))
     except ValueError:
         value = math.nan
     if not 0 < value < 100:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a loss of quality; write for example 0.1dB")
+        raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
     return value
 
 

@@ -19,6 +19,9 @@ _BYTE_ORDER_MARKS = (
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
 
+# Units of `byte_text`, by their powers of ten.
+UNITS = {9: "GB", 6: "MB", 3: "KB", 0: "bytes"}
+
 # Names that a message lists.
 NAMES_SHOWN = 8
 
@@ -42,6 +45,12 @@ def valid_unicode(text: str | os.PathLike[str]) -> str:
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun, in the plural unless it is one."""
     return f"{count:,} {noun}" + "s" * (count != 1)
+
+
+def byte_text(count: int) -> str:
+    """Return a number of bytes for a message, in the largest unit of which it is one: "20 KB", "1.5 GB"."""
+    power = max((p for p in (9, 6, 3) if count >= 10**p), default=0)
+    return f"{count / 10**power:.3g} {UNITS[power]}"
 
 
 def first_names(names: Sequence[str], command: str = "kpinfo --json") -> str:

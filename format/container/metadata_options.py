@@ -2,6 +2,7 @@
 
 import argparse
 import datetime
+import math
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -56,6 +57,8 @@ def view_limits(text: str) -> str | dict[str, Any]:
             raise argparse.ArgumentTypeError(f"{part!r} is not like azimuth=-30:30") from error
         if name not in LIMITS or name in found or len(numbers) != (1 if name == "reach" else 2):
             raise argparse.ArgumentTypeError(f"{part!r} is not like azimuth=-30:30 or reach=0.2, each at most once")
+        if not all(map(math.isfinite, numbers)):
+            raise argparse.ArgumentTypeError(f"{part!r}: write finite numbers, such as azimuth=-30:30")
         if numbers[0] > numbers[-1]:
             raise argparse.ArgumentTypeError(f"{part!r}: the least value is above the largest; swap them")
         found[name] = numbers[0] if name == "reach" else numbers

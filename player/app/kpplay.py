@@ -135,7 +135,7 @@ def _parser() -> argparse.ArgumentParser:
         help="for screenshots, videos and camera paths; it is made (default: the working directory)",
     )
     parser.add_argument(
-        "--frames", type=int, metavar="N", help="exit after N frames; settings are neither read nor saved"
+        "--frames", type=cli.whole_number, metavar="N", help="exit after N frames; settings are neither read nor saved"
     )
     parser.add_argument("--web", action="store_true", help="play in the browser of this machine, without a window")
     parser.add_argument("--screenshot", type=cli.output_file(".png"), metavar="PNG", help="save the window at the end")

@@ -66,6 +66,15 @@ def test_a_named_track_a_file_or_none_is_taken(dataset, folder, tmp_path):
     assert np.abs(samples[:, 1] / 0.5 - samples[:, 0])[960:-960].max() < 0.1
 
 
+@pytest.mark.parametrize(("channels", "bitrate", "bound"), [(1, None, 48_000), (2, None, 64_000), (1, 16_000, 16_000)])
+def test_no_sound_takes_more_than_its_bitrate(channels: int, bitrate: int | None, bound: int) -> None:
+    t = np.arange(4 * SAMPLE_RATE) / SAMPLE_RATE
+    tone = 0.5 * np.sin(2 * np.pi * 440 * t) * (2 * t % 1 < 0.5)  # hard: it begins and ends twice a second
+    sound = encode_sound(np.stack([tone] * channels, axis=1), bitrate)
+    header, reservoir = 8 * 50, 4000  # bits: a byte of each packet; what the first packets may take in advance
+    assert 8 * sum(map(len, sound.packets)) < (bound + header) * sound.duration_s + reservoir
+
+
 @pytest.mark.parametrize(
     "audio, words", [("cam09", "neither a camera nor a file; give one of cam00, cam01"), ("cam00", "has no sound in")]
 )

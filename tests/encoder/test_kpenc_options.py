@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from kpc.encoder.cli.options import parse
+from kpc.encoder.cli.read_dataset import read_dataset
 from kpc.encoder.cli.transcode import check_outputs
 from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.format.common.errors import UsageError
@@ -39,3 +40,17 @@ def test_no_output_is_removed_with_the_work_folder(tmp_path: Path) -> None:
     for name in (CHECKPOINT, "group-3.kpck"):
         with pytest.raises(UsageError, match="in its work folder; choose another with --keep-checkpoint"):
             checked(name)
+
+
+def test_options_that_contradict_each_other_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = (str(tmp_path), "-o", str(tmp_path / "x.kpc"))
+    assert "drop one" in refusal(capsys, *words, "--steps", "100", "--time-budget", "10s")
+    assert "drop --audio-bitrate" in refusal(capsys, *words, "--audio", "none", "--audio-bitrate", "48k")
+
+
+def test_options_about_missing_poses_are_refused_where_there_are_poses(tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").write_text("{}")
+    wishes = ["--distance", "a,b=2", "--sync", "audio", "--rig", "still", "--require-all"]
+    options, *_ = parse([str(tmp_path), "-o", str(tmp_path / "x.kpc"), *wishes])
+    with pytest.raises(UsageError, match=f"^--rig, --sync, --distance, --require-all: {tmp_path} has poses"):
+        read_dataset(options)

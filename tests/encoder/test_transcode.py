@@ -221,9 +221,29 @@ def test_a_file_becomes_smaller(searched: None, scene_file: Path, tmp_path: Path
     assert result["validation_loss_db"] == pytest.approx(lost) and "30 dB" in result["evaluated_on"]
 
 
-def test_a_file_keeps_its_symbols_at_a_loose_target(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
-    kpenc_says(scene_file, tmp_path / "same.kpc", "--target-size", "1MB")
-    assert (tmp_path / "same.kpc").read_bytes() == scene_file.read_bytes()
+@pytest.mark.parametrize(
+    ("target", "why"),
+    [
+        (("--target-size", "1MB"), "it is small enough (asked for at most 1,000,000 bytes)"),
+        (("--lam", "0.0001"), "no file of less cost was found (asked for lam 0.0001)"),  # all that counts is D
+    ],
+)
+def test_a_file_is_copied_where_nothing_is_better(
+    scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], target: tuple[str, str], why: str
+) -> None:
+    copy, size = tmp_path / "same.kpc", scene_file.stat().st_size
+    assert kpenc.main([str(scene_file), "-o", str(copy), "--tune-steps", "0", *target]) == 0
+    assert copy.read_bytes() == scene_file.read_bytes()
+    assert capsys.readouterr().out == f"{copy}: {size:,} bytes, a copy of the source, since {why}\n"
+
+
+def test_a_clip_in_groups_is_copied_with_the_metadata_that_is_given(
+    scene_file: Path, tmp_path: Path, kpenc_says: Kpenc
+) -> None:
+    clip, copy = tmp_path / "clip.kpc", tmp_path / "same.kpc"
+    groups.write(groups.group_inputs([scene_file, scene_file]), clip)
+    result = kpenc_says(clip, copy, "--target-size", "1MB", "--title", "A dancer")
+    assert result["is_copy"] and copy.read_bytes() == rewriting.with_metadata(clip, Metadata({"title": "A dancer"}))
 
 
 @pytest.mark.parametrize("is_grouped", [False, True])

@@ -503,7 +503,7 @@ def test_a_full_disk_is_a_failure_of_its_task(tmp_path: Path, monkeypatch: pytes
 
 
 def test_options_of_folders_are_checked(tmp_path: Path, take: Path) -> None:
-    with pytest.raises(FaultyBatch, match="invalid test_views value"):
+    with pytest.raises(FaultyBatch, match=r"'0\.5' is not a whole number from 1 on"):
         jobs.jobs_of_folders([str(take)], ["--test-views", "0.5"], Resources())
     with pytest.raises(UsageError, match="no such"):
         jobs.jobs_of_folders([str(tmp_path / "none")], [], Resources())

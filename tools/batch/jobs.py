@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from kpc.format.common import cli
-from kpc.format.common.errors import DatasetError, UsageError
+from kpc.format.common.errors import KpcError, UsageError
 from kpc.tools.batch.toml_lines import TomlLines
 
 # Options of kpenc that a batch sets itself, or that make no sense in one.
@@ -273,21 +273,19 @@ def _check_job(job: Job, faults: Faults) -> None:
     from kpc.encoder.cli import options as kpenc  # loads PyTorch, which workers need not
     from kpc.encoder.cli.read_dataset import check_folder
 
-    if not ADDRESS.match(job.source) and Path(job.source).is_dir():
-        try:
-            check_folder(Path(job.source))
-        except DatasetError as error:
-            faults.add(job.where, str(error))
-
     source = "folder" if ADDRESS.match(job.source) and not job.source.endswith(".kpc") else job.source
     if ADDRESS.match(job.source) and job.source.endswith(".kpc"):
         return  # its options are checked once the file is there
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            kpenc.parse([source, "-o", "scene.kpc", *job.options])
+            options, *_ = kpenc.parse([source, "-o", "scene.kpc", *job.options])
+        if not ADDRESS.match(job.source) and options.source.is_dir():
+            check_folder(options)
     except SystemExit:
         faults.add(job.where, said.getvalue().strip().rsplit("error: ", 1)[-1])
+    except KpcError as error:
+        faults.add(job.where, str(error))
 
 
 def _check_names(jobs: Sequence[Job], faults: Faults) -> None:

@@ -27,7 +27,7 @@ def add_parsers(kinds: Any) -> None:
         "--time-budget", type=cli.duration_s, metavar="10m", help="duration of training instead of a number of steps"
     )
     encode.add_argument(
-        "--psnr", type=cli.decibels, metavar="30dB", help="make the smallest file with this PSNR on training views"
+        "--psnr", type=cli.psnr_db, metavar="30dB", help="make the smallest file with this PSNR on training views"
     )
     encode.set_defaults(measure=_encode)
 
@@ -102,7 +102,10 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
         "--preset", choices=PRESETS, default=DEFAULT_PRESET, help="preset of kpenc (default: %(default)s)"
     )
     parser.add_argument(
-        "--seed", type=int, default=0, help="seed of the first repeat; each further one adds 1 (default: 0)"
+        "--seed",
+        type=cli.whole_number,
+        default=0,
+        help="seed of the first repeat; each further one adds 1 (default: 0)",
     )
     parser.add_argument("--downscale", type=harness.positive, default=1, help="average blocks of N x N pixels first")
     parser.add_argument(

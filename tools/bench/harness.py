@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
+from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
 from kpc.tools.bench.provenance import data_hash
 from kpc.tools.bench.records import Record
@@ -104,9 +105,7 @@ def add_repeats(parsers: Iterable[argparse.ArgumentParser]) -> None:
 
 def positive(text: str) -> int:
     """Parse an integer of at least 1."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
-    return int(text)
+    return cli.whole_number(text, 1)
 
 
 def minutes(text: str) -> tuple[float, ...]:

@@ -4,8 +4,10 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
+from kpc.format.common import cli
 from kpc.format.container import scene_io
 from kpc.player.quality import DEFAULT, LEVELS
 from kpc.tools.bench import harness, pacing, playback_stability, player_bench, streaming_bench, web_bench, web_loading
@@ -48,7 +50,7 @@ def add_parsers(kinds: Any) -> None:
     )
     window.add_argument(
         "--turn",
-        type=float,
+        type=partial(cli.number_within, low=-3600, high=3600),
         default=0.0,
         metavar="DEGREES",
         help="degrees per second by which the camera orbits the scene meanwhile (default: 0)",

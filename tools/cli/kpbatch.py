@@ -141,7 +141,7 @@ def _parse(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
 
 
 def _count(text: str) -> int:
-    return int(cli.number_within(text, 1, 4096, "a whole number"))
+    return cli.whole_number(text, 1, 4096)
 
 
 if __name__ == "__main__":

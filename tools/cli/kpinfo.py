@@ -60,7 +60,9 @@ def _parser() -> argparse.ArgumentParser:
     cli.add_version_option(parser)
     parser.add_argument("files", nargs="+", type=cli.file_name, metavar="file", help="a .kpc file, or its http address")
     parser.add_argument("--json", action="store_true", help="print a JSON object (docs/kpinfo.schema.json)")
-    parser.add_argument("--group", type=int, metavar="N", help="describe group N of a clip in groups, counted from 0")
+    parser.add_argument(
+        "--group", type=cli.whole_number, metavar="N", help="describe group N of a clip in groups, counted from 0"
+    )
     parser.add_argument("--verify", action="store_true", help="check every CRC32C and decode everything")
     parser.add_argument(
         "--memory",

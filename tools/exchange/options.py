@@ -9,7 +9,7 @@ from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.player.quality import LEVELS
 from kpc.tools.exchange.geometry_files import SUFFIXES as GEOMETRY_SUFFIXES
-from kpc.tools.rendering.options import add_times, integer, size
+from kpc.tools.rendering.options import add_times, size
 
 GLTF_SUFFIXES, USD_SUFFIXES = (".gltf", ".glb"), (".usda", ".usd", ".usdc")
 CAMERA_SUFFIXES = (".gltf", *USD_SUFFIXES)
@@ -78,7 +78,7 @@ def _add_geometry(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--mesh", action="store_true", help="write a mesh instead of points")
     group.add_argument(
         "--resolution",
-        type=functools.partial(integer, low=8, high=MAX_RESOLUTION),
+        type=functools.partial(cli.whole_number, low=8, high=MAX_RESOLUTION),
         metavar="N",
         help=f"mesh: points of the density grid along the longest edge of the box (default: {RESOLUTION})",
     )

@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
     )
     quality.add_argument(
         "--samples",
-        type=functools.partial(integer, low=1, high=MAX_SAMPLES),
+        type=functools.partial(cli.whole_number, low=1, high=MAX_SAMPLES),
         default=1,
         metavar="N",
         help="render N x N samples for each pixel, and take their mean in linear light (default: %(default)s)",
@@ -86,7 +86,7 @@ def _add_cameras(group: argparse._ArgumentGroup) -> None:
     )
     cameras.add_argument(
         "--orbit",
-        type=functools.partial(integer, low=1, high=MAX_PICTURES),
+        type=functools.partial(cli.whole_number, low=1, high=MAX_PICTURES),
         metavar="N",
         help="N views along a path around the scene while the clip plays once",
     )
@@ -125,7 +125,7 @@ def add_times(group: argparse._ArgumentGroup, is_rendering: bool = True) -> None
     )
     group.add_argument(
         "--step",
-        type=functools.partial(integer, low=1, high=MAX_PICTURES),
+        type=functools.partial(cli.whole_number, low=1, high=MAX_PICTURES),
         default=1,
         metavar="N",
         help="only every Nth frame" + "; a film still lasts as long" * is_rendering + " (default: %(default)s)",
@@ -198,19 +198,12 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
         help="codec of a film (default: h264 in .mp4 and .mkv, prores in .mov, vp9 in .webm)",
     )
     group.add_argument(
-        "--crf", type=functools.partial(integer, low=0, high=63), metavar="N",
+        "--crf", type=functools.partial(cli.whole_number, low=0, high=63), metavar="N",
         help="constant rate factor of a film: lower is better and larger (default: "
         + ", ".join(f"{name} {codec.crf[2]}" for name, codec in CODECS.items() if codec.crf)
         + ")",
     )  # fmt: skip
     group.add_argument("--bits", type=int, choices=(8, 10), help="bits per channel of a film (default: 8; prores: 10)")
-
-
-def integer(text: str, low: int, high: int) -> int:
-    """Parse a whole number from `low` to `high`."""
-    if not (text.isascii() and text.isdecimal()) or len(text) > 9 or not low <= int(text) <= high:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {low} to {high}")
-    return int(text)
 
 
 def _range(text: str) -> tuple[int, int]:
