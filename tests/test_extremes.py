@@ -19,8 +19,9 @@ from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate
 from kpc.encoder.field import kernels
 from kpc.encoder.field.bounds import find_box
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.field import Field, Layout
+from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import planes_of
+from kpc.encoder.field.layout import Layout
 from kpc.encoder.field.priors import plane_priors
 from kpc.encoder.field.render import Rays
 from kpc.encoder.training.optimisers import add_prior_gradients

@@ -66,6 +66,7 @@ class Options:
     decoder: str = "explicit"
     sampling: str = "grid"
     progressive: bool = False
+    layers: str = "one"
     steps: int | None = None
     time_budget_s: float | None = None
     seed: int = 0
@@ -209,6 +210,13 @@ def _add_training_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="train the coarse scales to make a picture of their own, for scenes that are shown while they are "
         "downloaded; costs about 0.4 dB of the whole",
+    )
+    parser.add_argument(
+        "--layers",
+        choices=("auto", "one"),
+        default=Options.layers,
+        help="auto: of a clip by cameras that stand still, what moves gets scales of its own, in the part of the scene "
+        "in which it moves; one: all scales hold both (default: %(default)s)",
     )
     steps = ", ".join(f"{name} {config.steps:,}" for name, config in sorted(PRESETS.items()))
     parser.add_argument("--steps", type=_positive, help=f"optimiser steps (default, by preset: {steps})")
@@ -392,6 +400,8 @@ def _check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         parser.error("--audio none leaves the sound out; drop --audio-bitrate")
     if given.steps is not None and given.time_budget is not None:
         parser.error("--steps and --time-budget both say how long to train; drop one")
+    if given.layers != "one" and given.group is not None:
+        parser.error("--layers auto is for clips in one piece; drop it, or --group")
     if given.dry_run and given.resume:
         parser.error("--dry-run estimates a whole run; drop --resume")
 
@@ -404,6 +414,7 @@ def _options_from(given: argparse.Namespace) -> Options:
         decoder=given.decoder,
         sampling=given.sampling,
         progressive=given.progressive,
+        layers=given.layers,
         steps=given.steps,
         time_budget_s=given.time_budget,
         seed=given.seed,

@@ -26,6 +26,7 @@ from kpc.encoder.field.bounds import (
 )
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.occupancy_grid import grid_shape
+from kpc.encoder.training.moving_area import MovingArea, find_moving_area
 from kpc.encoder.training.temporal_resolution import fit_frames_per_row
 from kpc.encoder.training.tight_bounds import trim_box
 from kpc.encoder.training.train import Trainer, load_checkpoint_box
@@ -133,7 +134,10 @@ def prepare_trainer(options: Options, setting: Setting) -> Trainer:
         else:
             assert not isinstance(mapping, Contraction)
             aabb, survey_s = trim_with_progress(dataset, config, aabb, options.time_budget_s, mapping)
-    trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s, mapping=mapping)
+    moving = None
+    if options.layers == "auto" and (moving := _find_moving_area(config, dataset, aabb, mapping)) is not None:
+        config = replace(config, moving_area=moving.box)
+    trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s, mapping=mapping, moving=moving)
     log(describe_model(trainer))
     if resumes:
         trainer.resume(checkpoint)
@@ -142,6 +146,19 @@ def prepare_trainer(options: Options, setting: Setting) -> Trainer:
     if options.resume:
         log(f"resumed at step {trainer.step}" if trainer.step else f"{checkpoint}: no checkpoint yet; starting afresh")
     return trainer
+
+
+def _find_moving_area(
+    config: TrainConfig, dataset: Dataset, aabb: np.ndarray, mapping: SpaceMapping | None
+) -> MovingArea | None:
+    """Return the area in which things move, and log the reason."""
+    area, why = None, "nothing moves"
+    if config.motion_cells or config.summed:
+        why = "the model is of another kind"
+    elif dataset.is_dynamic:
+        area, why = find_moving_area(dataset, aabb, mapping)
+    log(f"layers: {'all in one' if area is None else 'what moves has scales of its own'} ({why})")
+    return area
 
 
 def trim_with_progress(

@@ -12,7 +12,7 @@ from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.transcode import describe_copy, describe_outcome
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.field import time_rows
+from kpc.encoder.field.layout import time_rows
 from kpc.encoder.rdo.prune import Pruned
 from kpc.encoder.training.refinement import Correction
 from kpc.encoder.training.temporal_resolution import TimeResolution

@@ -17,7 +17,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from kpc.encoder.field.field import Layout
+from kpc.encoder.field.layout import Layout
 from kpc.encoder.training.torch_optimiser import TorchOptimiser
 from kpc.encoder.training.train import Trainer
 

@@ -50,6 +50,16 @@ class TrainConfig:
     # Cells of the motion grid (`kpc.format.scene.motion`) along the longest edge of the box; 0 for no motion grid.
     # Not for objects in static surroundings: a cell then holds some of both, and liam loses 4.6 dB.
     motion_cells: int = 0
+    # Lower and upper corner of the area in which things move, in shares of the space that the planes cover. Each of
+    # `resolutions` then makes two scales: one without space-time planes, and one with them that holds nothing outside
+    # the area (`kpc.encoder.training.moving_area`). None: scales of six planes that cover everything.
+    moving_area: tuple[float, ...] | None = None
+    # Texels of such a scale along the longest edge of the area, as a share of those of the other along that of the box.
+    moving_texels: float = 0.6
+    # Its rows in time, at most one for each frame, as a multiple of what `frames_per_row` gives.
+    moving_rows: float = 2.0
+    # Share of the run in which cells stay occupied where something is seen to move (measured).
+    moving_kept: float = 0.5
     # Whether to use the hybrid decoder, two small MLPs per sample (`kpc.format.scene.scene.HybridDecoder`).
     hybrid: bool = False
     # Width of its layers. K-Planes uses 64, and three layers.
@@ -220,6 +230,7 @@ class TrainConfig:
             "temporal_start",
             "temporal_floor",
             "time_tolerance",
+            "moving_kept",
             "prune_share",
             "dropout_until",
             "coarse_until",

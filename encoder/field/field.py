@@ -6,15 +6,14 @@ optimiser and the priors (`kpc.encoder.field.priors`) see one array. `kpc.encode
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.occupancy_grid import grid_shape
+from kpc.encoder.field.layout import AXES, Layout, border_elements
 from kpc.encoder.field.sampling import WeightedRowSum, bilinear_corners, displace
 from kpc.format.scene.scene import (
     ACTIVATION_LIMIT,
@@ -31,88 +30,15 @@ from kpc.format.scene.scene import (
 )
 from kpc.format.scene.space import SpaceMapping
 
-AXES = "xyzt"
-
 # Factor on the first layer of the hybrid decoder at the start: features start at about 0.03, the product of three
 # texels, and are to span that layer's range.
 FEATURE_GAIN = 8.0
 
+# Rows of space-time planes in a file, of scales that have none.
+FEWEST_ROWS = 2
+
 # A function of low, high and a shape that returns uniform random numbers.
 Uniform = Callable[..., Tensor]
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where each plane lies in `theta`.
-
-    Attributes:
-        resolution: (S, 4) int64, texels along x, y, z and t; t is 0 in a static scene.
-        channels: M, the same for all scales.
-        table: (S, 6) int64, first element of each plane in the order of ALL_PLANES; -1 for planes that do not exist.
-        size: number of elements of theta.
-    """
-
-    resolution: np.ndarray
-    channels: int
-    table: np.ndarray
-    size: int
-
-    @staticmethod
-    def of(resolution: np.ndarray, channels: int) -> "Layout":
-        """Return the layout of planes that lie one after the other, scale by scale."""
-        resolution = np.asarray(resolution, np.int64)
-        names = ALL_PLANES if resolution[0, 3] else SPACE_PLANES
-        table = np.full((len(resolution), 6), -1, np.int64)
-        size = 0
-        for s, axes in enumerate(resolution):
-            for c, name in enumerate(names):
-                table[s, c] = size
-                size += int(axes[AXES.index(name[0])] * axes[AXES.index(name[1])]) * channels
-        return Layout(resolution, channels, table, size)
-
-    @property
-    def is_dynamic(self) -> bool:
-        """Whether there are space-time planes."""
-        return bool(self.resolution[0, 3])
-
-    @property
-    def features(self) -> int:
-        """F, the number of features of a sample."""
-        return len(self.resolution) * self.channels
-
-    def planes(self) -> Iterator[tuple[int, str, int, int, int]]:
-        """Yield (scale, name, start, rows, columns) of every plane."""
-        for s, axes in enumerate(self.resolution):
-            for c, name in enumerate(ALL_PLANES):
-                if self.table[s, c] >= 0:
-                    yield s, name, int(self.table[s, c]), int(axes[AXES.index(name[1])]), int(axes[AXES.index(name[0])])
-
-
-def plan_layout(config: TrainConfig, aabb: np.ndarray, clip: Clip, is_dynamic: bool) -> Layout:
-    """Return a layout with `config.resolutions` texels along the box's longest edge, and as many per length elsewhere.
-
-    The number of time rows is the same at every scale (K-Planes, section 3.1). No axis has fewer than two texels.
-    """
-    edges = np.asarray(aabb[1] - aabb[0], np.float64)
-    rows = time_rows(clip.frame_count, config.frames_per_row) if is_dynamic else 0
-    resolution = [[max(2, round(n * e / edges.max())) for e in edges] + [rows] for n in config.resolutions]
-    return Layout.of(np.array(resolution), config.channels)
-
-
-def time_rows(frame_count: int, frames_per_row: float) -> int:
-    """Return the number of rows of the space-time planes."""
-    return max(2, math.ceil(frame_count / frames_per_row))
-
-
-def motion_grid_shape(config: TrainConfig, aabb: np.ndarray, layout: Layout) -> tuple[int, int, int, int] | None:
-    """Return the nodes of the motion grid along t, z, y and x, or None where there is none.
-
-    Along t there is one for each row of the space-time planes; cells are as nearly cubes as whole numbers allow.
-    """
-    if not config.motion_cells or not layout.is_dynamic:
-        return None
-    nz, ny, nx = grid_shape(aabb, config.motion_cells)
-    return int(layout.resolution[0, 3]), nz + 1, ny + 1, nx + 1
 
 
 class Field(nn.Module):
@@ -127,12 +53,16 @@ class Field(nn.Module):
         density: (F + 1,) weights of the log density, its bias last.
         w1, b1, w2, b2: the direction MLP, shapes as in `kpc.format.scene.scene.Decoder`. w2 starts at 0: colour depends
             on the direction only as far as the pictures ask for it.
-        axes, sizes, first: constants of `features`: the axes, sizes and first texels of the planes.
+        axes, sizes, first, areas: constants of `features`: the axes, sizes and first texels of the planes, and
+            `Layout.areas`.
+        border: elements of theta that stay 0, `clear_border`.
     """
 
     axes: Tensor
     sizes: Tensor
     first: Tensor
+    areas: Tensor
+    border: Tensor
 
     # What a space-time plane holds where nothing changes: the identity of `combine`.
     IDENTITY = 1.0
@@ -171,8 +101,14 @@ class Field(nn.Module):
         names = ALL_PLANES if layout.is_dynamic else SPACE_PLANES
         axes = torch.tensor([[AXES.index(axis) for axis in of_all] for of_all in zip(*names, strict=True)])
         self._constant("axes", axes)
-        self._constant("sizes", torch.from_numpy(layout.resolution.T)[axes][:, :, None])
-        self._constant("first", torch.from_numpy(layout.table.T[: len(names), None, :, None] // layout.channels))
+        table = layout.table.T[: len(names), None, :, None]
+        sizes = torch.from_numpy(layout.held.T)[axes][:, :, None]
+        # Planes that do not exist are read from four texels of 1 behind all others.
+        self._constant("sizes", torch.where(torch.from_numpy(table[None, ..., 0]) < 0, 2, sizes))
+        self._constant("first", torch.from_numpy(np.where(table < 0, layout.size, table) // layout.channels))
+        self._constant("areas", torch.from_numpy(layout.areas))
+        self._constant("border", torch.from_numpy(border_elements(layout)))
+        self.clear_border()
         self._make_decoder(layout.features, hidden, uniform)
 
     def _constant(self, name: str, values: Tensor) -> None:
@@ -200,8 +136,8 @@ class Field(nn.Module):
         return neighbours, shares.to(self.theta.dtype)
 
     def plane(self, scale: int, name: str) -> Tensor:
-        """Return a view of one plane, (rows, columns, M)."""
-        axes = self.layout.resolution[scale]
+        """Return a view of one plane, as far as it is held, (rows, columns, M)."""
+        axes = self.layout.held[scale]
         rows, columns = int(axes[AXES.index(name[1])]), int(axes[AXES.index(name[0])])
         start = int(self.layout.table[scale, ALL_PLANES.index(name)])
         M = self.layout.channels
@@ -273,11 +209,23 @@ class Field(nn.Module):
         """
         if self.motion is not None:
             points = displace(points, times, self.motion)
-        u, v = torch.cat([points, times[:, None]], dim=1).T[self.axes, :, None]  # (C, N, 1) each
+        table, inside = self.theta.view(-1, self.layout.channels), None
+        if self.layout.is_uniform:
+            u, v = torch.cat([points, times[:, None]], dim=1).T[self.axes, :, None]  # (C, N, 1) each
+        else:
+            at = (points[:, None] - self.areas[:, 0, :3]) * self.areas[:, 1, :3]  # (N, S, 3)
+            inside = ((at >= 0) & (at <= 1)).all(2, keepdim=True) | (self.areas[:, 0, 3:] == 0)
+            u, v = torch.cat([at, times[:, None, None].expand(-1, at.shape[1], 1)], dim=2).permute(2, 0, 1)[self.axes]
+            table = torch.cat([table, table.new_ones(4, self.layout.channels)])
         corners, weights = bilinear_corners(u, v, *self.sizes)  # (C, N, S, 4)
-        table = self.theta.view(-1, self.layout.channels)
         planes = WeightedRowSum.apply(table, self.first + corners, weights)  # type: ignore[no-untyped-call]
-        return self.combine(planes).flatten(1)  # each plane: (N, S, M)
+        features = self.combine(planes)  # each plane: (N, S, M)
+        return (features if inside is None else features * inside).flatten(1)
+
+    def clear_border(self) -> None:
+        """Set the outermost texels of areas to 0, so that nothing jumps where they end."""
+        with torch.no_grad():
+            self.theta[self.border] = 0
 
     def to_scene(
         self,
@@ -298,11 +246,7 @@ class Field(nn.Module):
             appearance_names: of the codes, as many.
         """
         names = ALL_PLANES if self.layout.is_dynamic else SPACE_PLANES
-        with torch.no_grad():
-            scales = tuple(
-                {name: self.plane(s, name).cpu().numpy().copy() for name in names}
-                for s in range(len(self.layout.resolution))
-            )
+        scales = tuple({name: self._whole_plane(s, name) for name in names} for s in range(len(self.layout.resolution)))
         decoder, codes = self.export_decoder(), np.zeros((0, len(self.b1)), np.float32)
         if self.codes is not None:
             mean = _array(self.codes).mean(0, dtype=np.float64).astype(np.float32)
@@ -319,6 +263,17 @@ class Field(nn.Module):
             motion=None if self.motion is None else _array(self.motion),
             appearances=tuple(Appearance(name, code) for name, code in zip(appearance_names, codes, strict=True)),
         )
+
+    def _whole_plane(self, scale: int, name: str) -> np.ndarray:
+        """Return one plane of the whole box, (rows, columns, M): 0 or 1 where it is not held."""
+        layout, axes = self.layout, [AXES.index(axis) for axis in name]
+        columns, rows = (max(int(layout.resolution[scale, axis]), FEWEST_ROWS) for axis in axes)
+        whole = np.full((rows, columns, layout.channels), float(name in TIME_PLANES), np.float32)
+        if layout.table[scale, ALL_PLANES.index(name)] >= 0:
+            held = _array(self.plane(scale, name))
+            x, y = (int(layout.first[scale, axis]) if axis < 3 else 0 for axis in axes)
+            whole[y : y + held.shape[0], x : x + held.shape[1]] = held
+        return whole
 
     @staticmethod
     def from_scene(scene: Scene) -> "Field":

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from kpc.encoder.field import kernels
-from kpc.encoder.field.field import Field, Layout, SummedField
+from kpc.encoder.field.field import Field, SummedField
+from kpc.encoder.field.layout import Layout
 from kpc.encoder.field.render import Rays, RayWeights, Samples, weigh_samples
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, SpaceMapping
@@ -28,14 +29,13 @@ def plane_set(
     """Return planes (n,) and motion grid as the kernels take them, with the coarsest `scales` only where given."""
     if motion is None:
         motion = np.zeros((0, 1, 1, 1, 3), np.float32)
-    table, resolution = layout.table[:scales], layout.resolution[:scales]
+    table, held = layout.table[:scales], layout.held[:scales]
     places = np.zeros((len(table), 2, kernels.PLACES), np.int32)
-    places[:, 0, : len(kernels.AXES)] = table // layout.channels
-    places[:, 1, : len(kernels.AXES)] = resolution[:, [column_axis for column_axis, _ in kernels.AXES]]
-    intervals = (resolution - 1).astype(np.float32)
-    return kernels.PlaneSet(
-        theta, places.reshape(len(table), -1), intervals, layout.channels, layout.is_dynamic, motion
-    )
+    places[:, 0, : len(kernels.AXES)] = np.maximum(table, 0) // layout.channels
+    places[:, 1, : len(kernels.AXES)] = held[:, [column_axis for column_axis, _ in kernels.AXES]]
+    intervals = (held - 1).astype(np.float32)
+    areas = layout.areas[:scales].reshape(len(table), -1)
+    return kernels.PlaneSet(theta, places.reshape(len(table), -1), intervals, layout.channels, areas, motion)
 
 
 def planes_of(field: Field, scales: int | None = None) -> kernels.PlaneSet:

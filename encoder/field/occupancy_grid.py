@@ -48,6 +48,7 @@ class OccupancyGrid:
         log_density: (Nz, Ny, Nx) float32, decaying maximum of the samples in a cell.
         peak: (Nz, Ny, Nx) float32, decaying maximum of the weights of training rays in a cell.
         occupied: (Nz, Ny, Nx) bool.
+        kept: (Nz, Ny, Nx) bool, cells that are occupied in any case; None for none.
         active: (slots, Nz, Ny, Nx) bool, the occupied cells where rays take samples in each time slot; one slot until
             `split`.
     """
@@ -72,6 +73,7 @@ class OccupancyGrid:
         self.log_density = np.full(visible.shape, -np.inf, np.float32)
         self.peak = np.ones(visible.shape, np.float32)
         self.occupied = visible.copy()
+        self.kept: np.ndarray | None = None
         self.active = self.occupied[None]
         self._dense = np.ones((1, *visible.shape), bool)
         self._is_sampled = False
@@ -98,7 +100,7 @@ class OccupancyGrid:
                 self.log_density[chosen], self._sample(density_at, cells, rng, 0.0, 1.0)
             )
         self.occupied = matters & (self.log_density > self._density_threshold())
-        self.active = self._dense & self.occupied
+        self._activate()
 
     def split(self, density_at: DensityAt, slots: int, rng: np.random.Generator) -> None:
         """Restrict active cells, in each of `slots` equal parts of the clip, to where density is close by.
@@ -107,7 +109,13 @@ class OccupancyGrid:
         neighbouring slot and cell, so that displacements can go on changing until the next split.
         """
         self._dense = dilate(self.sample_slots(density_at, rng, slots, self.SAMPLES), SPACE_TIME_AXES)
-        self.active = self._dense & self.occupied
+        self._activate()
+
+    def _activate(self) -> None:
+        """Set `active` to the cells that are occupied and hold density, and `kept`."""
+        if self.kept is not None:
+            self.occupied |= self.kept
+        self.active = self.occupied & (self._dense if self.kept is None else self._dense | self.kept)
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint holds of this grid."""
@@ -123,7 +131,7 @@ class OccupancyGrid:
         """Take over what `state` returned."""
         names = ("log_density", "peak", "occupied", "dense")
         self.log_density, self.peak, self.occupied, self._dense = (state[name].cpu().numpy() for name in names)
-        self.active = self._dense & self.occupied
+        self._activate()
         self._is_sampled = bool(state["known"])
 
     def _density_threshold(self) -> float:

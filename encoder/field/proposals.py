@@ -13,8 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.field import Field, plan_layout
+from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import fused_features
+from kpc.encoder.field.layout import plan_layout
 from kpc.encoder.field.render import Rays, Samples, cell_indices, plane_coordinates, ray_spans
 from kpc.format.scene.scene import Clip
 from kpc.format.scene.space import SpaceMapping
@@ -41,7 +42,7 @@ class Proposals(nn.Module):
         super().__init__()
         fields = []
         for level, texels in enumerate(config.proposal_resolutions):
-            shape = replace(config, resolutions=(texels,), channels=config.proposal_channels)
+            shape = replace(config, resolutions=(texels,), channels=config.proposal_channels, moving_area=None)
             generator = torch.Generator().manual_seed(config.seed + 1 + level)
             fields.append(Field(plan_layout(shape, aabb, clip, is_dynamic), 1, generator))
         self.fields = nn.ModuleList(fields)

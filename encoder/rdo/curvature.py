@@ -21,8 +21,8 @@ import torch
 
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import ValidationRays
-from kpc.encoder.field.field import Layout
 from kpc.encoder.field.fused import march_scene
+from kpc.encoder.field.layout import Layout
 from kpc.encoder.field.render import shade
 from kpc.format.common.progress import progress
 from kpc.format.scene.scene import Scene

@@ -14,7 +14,8 @@ import torch
 
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field import render
-from kpc.encoder.field.field import Field, Layout
+from kpc.encoder.field.field import Field
+from kpc.encoder.field.layout import Layout
 from kpc.encoder.rdo.curvature import PerPlane
 from kpc.format.scene.scene import Decoder, Scene
 from kpc.format.scene.space import Contraction

@@ -131,7 +131,7 @@ def _finetune(
     fixed = [
         slice(start, start + rows * columns * M)
         for s, name, start, rows, columns in field.layout.planes()
-        if (s, name) in settled
+        if (s, name) in settled or (name in TIME_PLANES and (scene.scales[s][name] == 1).all())
     ]
     before = [theta[part].copy() for part in fixed]
     drawn = ValidationRays.through_occupied(scene, RAYS * steps, seed=100 + seed)

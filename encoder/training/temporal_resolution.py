@@ -12,7 +12,7 @@ import numpy as np
 
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.field import time_rows
+from kpc.encoder.field.layout import time_rows
 from kpc.encoder.training.importance import group_by_camera, has_static_cameras, premultiply_alpha
 
 # The most cameras that are measured, spans of the clip for each, and pictures in a span.

@@ -16,20 +16,16 @@ from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.appearances import assign_appearances
 from kpc.encoder.field.bounds import visible_cells
 from kpc.encoder.field.config import PRESETS, TrainConfig
-from kpc.encoder.field.field import (
-    Field,
-    HybridField,
-    SummedField,
-    motion_grid_shape,
-    plan_layout,
-)
+from kpc.encoder.field.field import Field, HybridField, SummedField
 from kpc.encoder.field.fused import log_densities
+from kpc.encoder.field.layout import motion_grid_shape, plan_layout
 from kpc.encoder.field.occupancy_grid import OccupancyGrid, grid_shape
 from kpc.encoder.field.priors import appearance_priors, motion_priors, plane_priors
 from kpc.encoder.field.proposals import Proposals
 from kpc.encoder.training.checkpoint import save_state
 from kpc.encoder.training.fused_optimiser import FusedOptimiser
 from kpc.encoder.training.importance import TileWeights, has_static_cameras
+from kpc.encoder.training.moving_area import MovingArea
 from kpc.encoder.training.refinement import Refinement
 from kpc.encoder.training.sampler import RaySampler
 from kpc.encoder.training.torch_optimiser import TorchOptimiser
@@ -90,6 +86,7 @@ class Trainer:
         device: str,
         elapsed_s: float = 0.0,
         mapping: SpaceMapping | None = None,
+        moving: MovingArea | None = None,
     ) -> None:
         self.dataset, self.config, self.device, self.mapping = dataset, config, torch.device(device), mapping
         self.aabb = np.asarray(aabb, np.float32)
@@ -111,6 +108,8 @@ class Trainer:
         shape = grid_shape(self.aabb, config.cells_across)
         threshold = math.log(-math.log(1 - config.occupancy_alpha) * steps_across)
         self.grid = OccupancyGrid(visible_cells(dataset.pictures, self.aabb, shape, mapping), threshold)
+        if moving is not None:
+            self.grid.kept = moving.cells(shape) & self.grid.visible
         self.slots = min(config.occupancy_slots, dataset.clip.frame_count) if dataset.is_dynamic else 1
         on_cpu = self.device.type == "cpu"
         proposals = (
@@ -196,7 +195,7 @@ class Trainer:
         """Do one step at a fraction of the run; return its mean squared error and its number of rays."""
         config = self.config
         with self.timers("occupancy"):
-            self._update_grid()
+            self._update_grid(fraction)
         count = self.rays_per_step
         background = None if self.dataset.has_alpha else self.background
         with self.timers("rays"):
@@ -215,6 +214,7 @@ class Trainer:
             self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1),
             self.extent,
         )
+        self.field.clear_border()
         if not math.isfinite(squared_error):
             raise TrainingError(f"step {self.step}: {self._not_finite()}; try another --seed or --preset")
         if self.cameras is not None and fraction >= config.refine_from:
@@ -252,9 +252,11 @@ class Trainer:
             cameras.align(pixels, self.optimiser.ray_gradients, rate)
         self.optimiser.config = self.config
 
-    def _update_grid(self) -> None:
+    def _update_grid(self, fraction: float) -> None:
         """Update the occupancy grid where it is due at this step."""
         config = self.config
+        if fraction >= config.moving_kept:
+            self.grid.kept = None
         if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
             self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
         if self.slots > 1 and self.step >= 4 * config.occupancy_start and self.step % config.occupancy_split_every == 0:

@@ -59,6 +59,19 @@ class QuantisedPlane:
         return dequantise_symbols(self.symbols, self.step, self.offset)
 
 
+def held_texels(values: np.ndarray) -> np.ndarray:
+    """Return (H, W) bool: the smallest rectangle with all texels of a plane (H, W, M) that are not 0 in all channels.
+
+    A scale that describes a part of the box is 0 elsewhere.
+    """
+    some = (values != 0).any(axis=2)
+    held = np.zeros(some.shape, bool)
+    if some.any():
+        (top, bottom), (left, right) = (np.flatnonzero(some.any(axis=axis))[[0, -1]] for axis in (1, 0))
+        held[top : bottom + 1, left : right + 1] = True
+    return held
+
+
 def dequantise_symbols(symbols: np.ndarray, step: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Return (..., M) float32 values of (..., M) int8: symbol * step + offset, rounded after product and after sum."""
     values = symbols.astype(np.float32)
@@ -81,6 +94,7 @@ def quantise_plane(
     just so far that 8 bits hold the whole range; a step too small for the range is enlarged to range / 255. All needed
     texels are coded.
 
+    Where texels at its edges are 0 (`held_texels`), these are not coded, and the offset is 0.
     Time planes (identity=True): the offset is 1; a step too small is enlarged until [-128, 127] reaches both ends of
     the range. Texels whose symbols are all 0 are not coded.
 
@@ -98,6 +112,9 @@ def quantise_plane(
     rows, columns, channels = values.shape
     step = np.broadcast_to(np.asarray(step, np.float32), (channels,)).copy()
     needed = np.ones((rows, columns), bool) if needed is None else needed.astype(bool)
+    held = held_texels(values)
+    if empty := not identity and not held.all():
+        needed &= held
     wanted = values[needed].astype(np.float64)  # (needed texels, M)
     if not (np.abs(wanted) <= VALUE_LIMIT / 2).all():
         raise FormatError(
@@ -109,7 +126,10 @@ def quantise_plane(
     step = np.minimum(step, np.float32(COARSEST_STEP))
 
     low, high = (wanted.min(0), wanted.max(0)) if len(wanted) else (np.ones(channels), np.ones(channels))
-    if identity:
+    if empty:
+        offset = np.zeros(channels, np.float32)
+        step = _at_least(step, np.maximum(high / SYMBOL_MAX, low / SYMBOL_MIN))
+    elif identity:
         offset = np.ones(channels, np.float32)
         step = _at_least(step, np.maximum((high - 1.0) / SYMBOL_MAX, (low - 1.0) / SYMBOL_MIN))
     else:

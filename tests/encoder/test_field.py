@@ -9,7 +9,8 @@ import torch
 
 from gradients import bilinear
 from kpc.encoder.field.config import PRESETS, TrainConfig
-from kpc.encoder.field.field import Field, Layout, motion_grid_shape, plan_layout
+from kpc.encoder.field.field import Field
+from kpc.encoder.field.layout import Layout, motion_grid_shape, plan_layout
 from kpc.encoder.field.priors import motion_priors
 from kpc.encoder.field.sampling import scatter_rows, scatter_rows_sparse
 from kpc.format.common.errors import UsageError

@@ -27,7 +27,8 @@ from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.field.config import PRESETS
-from kpc.encoder.field.field import Field, Layout
+from kpc.encoder.field.field import Field
+from kpc.encoder.field.layout import Layout
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.encoder.training.train import Trainer
 from kpc.format.common.errors import DatasetError, UsageError

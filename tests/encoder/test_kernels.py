@@ -22,7 +22,7 @@ from gradients import FIELD_KINDS, FieldFunction, random_rays, translucent_scene
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.field import Field, Layout
+from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import (
     count_samples,
     fused_features,
@@ -34,6 +34,7 @@ from kpc.encoder.field.fused import (
 )
 from kpc.encoder.field.kernels import compilation
 from kpc.encoder.field.kernels.backward import LEAST_PEAK
+from kpc.encoder.field.layout import Layout
 from kpc.encoder.field.priors import plane_priors
 from kpc.encoder.field.render import Rays, render_reference
 from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_prior_gradients
@@ -105,12 +106,12 @@ def test_compiled_and_cached_kernels_give_equal_results(tmp_path: Path) -> None:
     field, rng = Field.from_scene(tiny_scene()), np.random.default_rng(0)
     planes, density = planes_of(field), field.density.detach().numpy()
     at = rng.random((500, 3), np.float32), rng.random(500, np.float32)
-    np.savez(tmp_path / "in.npz", planes.theta, planes.places, planes.intervals, density, *at)
+    np.savez(tmp_path / "in.npz", planes.theta, planes.places, planes.intervals, planes.areas, density, *at)
     script = (
         "import sys, numpy\nfrom kpc.encoder.field import kernels\n"
-        "theta, places, intervals, density, points, times = numpy.load(sys.argv[1]).values()\n"
+        "theta, places, intervals, areas, density, points, times = numpy.load(sys.argv[1]).values()\n"
         "motion = numpy.zeros((0, 1, 1, 1, 3), numpy.float32)\n"
-        f"planes = kernels.PlaneSet(theta, places, intervals, {planes.channels}, {planes.is_dynamic}, motion)\n"
+        f"planes = kernels.PlaneSet(theta, places, intervals, {planes.channels}, areas, motion)\n"
         "logs = kernels.log_densities(planes, density, points, times, 2)\n"
         "sys.stdout.buffer.write(logs.tobytes())"
     )

@@ -9,7 +9,7 @@ from test_train import BOX, CONFIG
 
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation import profile
-from kpc.encoder.field.field import Layout
+from kpc.encoder.field.layout import Layout
 from kpc.encoder.training.train import Trainer
 from kpc.tools.bench import machine_limits
 

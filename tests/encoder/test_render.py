@@ -9,8 +9,9 @@ import torch
 from gradients import FIELD_KINDS, FieldFunction, bilinear, random_rays, translucent_scene
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.field import Field, HybridField, Layout, SummedField
+from kpc.encoder.field.field import Field, HybridField, SummedField
 from kpc.encoder.field.fused import fused_features, max_samples_per_ray, sample_rays_fused
+from kpc.encoder.field.layout import Layout
 from kpc.encoder.field.render import Rays, sample_rays, select_reached, shade, weigh_samples
 from kpc.encoder.training.cuda_graphs import GraphCache
 from kpc.encoder.training.torch_optimiser import DeferredReadback, TorchOptimiser

@@ -11,7 +11,7 @@ import pytest
 import datasets as make
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.field import time_rows
+from kpc.encoder.field.layout import time_rows
 from kpc.encoder.training import temporal_resolution
 from kpc.encoder.training.temporal_resolution import fit_frames_per_row, measure_time_resolution
 from kpc.format.common.images import write_image

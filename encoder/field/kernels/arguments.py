@@ -17,9 +17,9 @@ class PlaneSet(NamedTuple):
 
     theta: np.ndarray  # (n,) float32, all planes one after the other, each (rows, columns, M)
     places: np.ndarray  # (S, 16) int32: of xy xz yz xt yt zt first texel in theta [0:6], texels in a row [8:14]
-    intervals: np.ndarray  # (S, 4) float32, between texels along x, y, z and t
+    intervals: np.ndarray  # (S, 4) float32, between texels along x, y, z and t; -1 without planes in space and time
     channels: int  # M
-    is_dynamic: bool  # whether there are planes in space and time
+    areas: np.ndarray  # (S, 8) float32, `kpc.encoder.field.layout.Layout.areas`
     motion: np.ndarray  # (T, Nz, Ny, Nx, 3) float32, displacements (`kpc.format.scene.motion`); T is 0: there are none
 
 
@@ -69,6 +69,7 @@ class RayBuffers(NamedTuple):
 
     values: np.ndarray  # (K, S * 6 * M) float32, what each plane holds at a sample
     features: np.ndarray  # (K, F) float32
+    local: np.ndarray  # (1, 4) float32: u in the area of a scale, and time, of the current sample
     points: np.ndarray  # (K, POINT) float32: u displaced, time, u before displacement, time
     s: np.ndarray  # (K,) float32
     log_densities: np.ndarray  # (K,) float32, clipped
@@ -80,3 +81,4 @@ class RayBuffers(NamedTuple):
     decoder: np.ndarray  # (4 * F,) float32, weights of the log density and of three colours, of the current ray
     g_decoder: np.ndarray  # (4 * F,) float32, their gradient
     g_point: np.ndarray  # (4,) float32, gradient with respect to u and time
+    g_local: np.ndarray  # (4,) float32, the same with respect to `local`

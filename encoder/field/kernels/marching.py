@@ -42,6 +42,7 @@ def new_ray_buffers(planes, capacity):
     return RayBuffers(
         np.empty((capacity, S * 6 * M), np.float32),
         np.empty((capacity, S * M), np.float32),
+        np.empty((1, 4), np.float32),
         np.empty((capacity, POINT), np.float32),
         np.empty(capacity, np.float32),
         np.empty(capacity, np.float32),
@@ -52,6 +53,7 @@ def new_ray_buffers(planes, capacity):
         np.empty((1, S * M), np.float32),
         np.empty(4 * S * M, np.float32),
         np.empty(4 * S * M, np.float32),
+        np.empty(4, np.float32),
         np.empty(4, np.float32),
     )
 

@@ -7,6 +7,30 @@ from kpc.encoder.field.kernels.texels import POINT, add_slopes, displace, sample
 
 
 @inlined
+def is_part(planes, s):
+    """Return whether scale s covers a part of the box only."""
+    return planes.areas[s, 3] > np.float32(0.0)
+
+
+@inlined
+def is_moving(planes, s):
+    """Return whether scale s has planes in space and time."""
+    return planes.intervals[s, 3] > np.float32(0.0)
+
+
+@inlined
+def find_local(planes, buffers, k, s):
+    """Set buffers.local to sample k in the area of scale s; return whether it lies there."""
+    inside = True
+    for axis in range(3):
+        u = (buffers.points[k, axis] - planes.areas[s, axis]) * planes.areas[s, 4 + axis]
+        buffers.local[0, axis] = u
+        inside = inside and u >= np.float32(0.0) and u <= np.float32(1.0)
+    buffers.local[0, 3] = buffers.points[k, 3]
+    return inside
+
+
+@inlined
 def sample_planes(planes, buffers, k, features, row):
     """Sample every plane at buffers.points[k], and write the products over planes to a row of `features` (n, F).
 
@@ -14,11 +38,17 @@ def sample_planes(planes, buffers, k, features, row):
     holds there.
     """
     grid, M, scales = (planes.theta, planes.places, planes.intervals), planes.channels, planes.places.shape[0]
-    point = buffers.points, POINT * k
     for s in range(scales):
         values = buffers.values, (k * scales + s) * 6 * M
         products = features, (row * scales + s) * M
-        if planes.is_dynamic:
+        point = buffers.points, POINT * k
+        if is_part(planes, s):
+            if not find_local(planes, buffers, k, s):
+                for m in range(M):
+                    features[row, s * M + m] = np.float32(0.0)
+                continue
+            point = buffers.local, 0
+        if is_moving(planes, s):
             sample_scale(grid, s, point, M, 6, values, products)
         else:
             sample_scale(grid, s, point, M, 3, values, products)
@@ -48,21 +78,30 @@ def scatter_planes(planes, g_theta, g_features, row, buffers, k, wants_point):
     """
     grid = planes.theta, planes.places, planes.intervals
     g_grid, M, scales = (g_theta, planes.places, planes.intervals), planes.channels, planes.places.shape[0]
-    points, g_point = buffers.points, buffers.g_point
-    point = points, POINT * k
+    points, g_point, g_local = buffers.points, buffers.g_point, buffers.g_local
     if wants_point:
         g_point[:] = np.float32(0.0)
     for s in range(scales):
         values = buffers.values, (k * scales + s) * 6 * M
         g_products = g_features, (row * scales + s) * M
-        if planes.is_dynamic:
+        point = points, POINT * k
+        if is_part(planes, s):
+            if not find_local(planes, buffers, k, s):
+                continue
+            point = buffers.local, 0
+        g_local[:] = np.float32(0.0)
+        if is_moving(planes, s):
             scatter_scale(g_grid, s, point, M, 6, values, g_products)
             if wants_point:
-                add_slopes(grid, s, point, M, 6, values, g_products, g_point)
+                add_slopes(grid, s, point, M, 6, values, g_products, g_local)
         else:
             scatter_scale(g_grid, s, point, M, 3, values, g_products)
             if wants_point:
-                add_slopes(grid, s, point, M, 3, values, g_products, g_point)
+                add_slopes(grid, s, point, M, 3, values, g_products, g_local)
+        if wants_point:
+            for axis in range(3):
+                g_point[axis] += planes.areas[s, 4 + axis] * g_local[axis]
+            g_point[3] += g_local[3]
     if wants_point:
         for axis in range(4):
             if points[k, axis] < np.float32(0.0) or points[k, axis] > np.float32(1.0):  # clamped

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 
 from kpc.encoder.field import kernels
-from kpc.encoder.field.field import Field, Layout
+from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import planes_of
+from kpc.encoder.field.layout import Layout
 from kpc.encoder.field.render import Rays
 from kpc.format.coding.quantise import VALUE_LIMIT
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, Scene

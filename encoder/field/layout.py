@@ -1,0 +1,157 @@
+"""Where the planes of a field lie in its vector of parameters, and how large they are."""
+
+import functools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.field.occupancy_grid import grid_shape
+from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip
+
+AXES = "xyzt"
+
+# Texels of the scales of moving areas are smaller than those of the others by this factor at most: players hold them as
+# if they covered the box.
+MOST_FINER = 3.0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each plane lies in `theta`.
+
+    A scale may hold the texels of a part of the box only, its *area*: the others of its space planes are 0, those of
+    its space-time planes 1, so that its features are 0 outside.
+
+    Attributes:
+        resolution: (S, 4) int64, texels along x, y, z and t; t is 0 in a scale without space-time planes.
+        channels: M, the same for all scales.
+        table: (S, 6) int64, first element of each plane in the order of ALL_PLANES; -1 for planes that do not exist.
+        size: number of elements of theta.
+        first: (S, 3) int64, the first texel that is held along x, y and z.
+        held: (S, 4) int64, texels that are held along x, y, z and t.
+    """
+
+    resolution: np.ndarray
+    channels: int
+    table: np.ndarray
+    size: int
+    first: np.ndarray
+    held: np.ndarray
+
+    @staticmethod
+    def of(resolution: np.ndarray, channels: int, spans: np.ndarray | None = None) -> "Layout":
+        """Return the layout of planes that lie one after the other, scale by scale.
+
+        Args:
+            spans: (S, 3, 2), along x, y and z the first texel of each scale's area, and how many it has; None where
+                all scales cover the box.
+        """
+        resolution = np.asarray(resolution, np.int64)
+        first, held = np.zeros((len(resolution), 3), np.int64), resolution.copy()
+        if spans is not None:
+            first, held[:, :3] = np.asarray(spans, np.int64)[..., 0], np.asarray(spans, np.int64)[..., 1]
+        table = np.full((len(resolution), 6), -1, np.int64)
+        size = 0
+        for s, axes in enumerate(held):
+            for c, name in enumerate(ALL_PLANES if axes[3] else SPACE_PLANES):
+                table[s, c] = size
+                size += int(axes[AXES.index(name[0])] * axes[AXES.index(name[1])]) * channels
+        return Layout(resolution, channels, table, size, first, held)
+
+    @property
+    def is_dynamic(self) -> bool:
+        """Whether there are space-time planes."""
+        return bool(self.resolution[:, 3].any())
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether all scales cover the box, and have the same planes."""
+        return bool((self.held == self.resolution).all() and len(set((self.resolution[:, 3] > 0).tolist())) == 1)
+
+    @functools.cached_property
+    def areas(self) -> np.ndarray:
+        """(S, 2, 4) float32: of each scale along x, y and z where its area begins in [0, 1], and how often it would fit
+        the box; at last 1 and 0 where that is a part of the box."""
+        spaces = np.maximum(self.resolution[:, :3] - 1, 1)
+        areas = np.zeros((len(spaces), 2, 4), np.float32)
+        areas[:, 0, :3] = self.first / spaces
+        areas[:, 1, :3] = spaces / np.maximum(self.held[:, :3] - 1, 1)
+        areas[:, 0, 3] = (self.held != self.resolution).any(1)
+        return areas
+
+    @property
+    def features(self) -> int:
+        """F, the number of features of a sample."""
+        return len(self.resolution) * self.channels
+
+    def planes(self) -> Iterator[tuple[int, str, int, int, int]]:
+        """Yield (scale, name, start, rows, columns) of every plane, as far as it is held."""
+        for s, axes in enumerate(self.held):
+            for c, name in enumerate(ALL_PLANES):
+                if self.table[s, c] >= 0:
+                    yield s, name, int(self.table[s, c]), int(axes[AXES.index(name[1])]), int(axes[AXES.index(name[0])])
+
+
+def plan_layout(config: TrainConfig, aabb: np.ndarray, clip: Clip, is_dynamic: bool) -> Layout:
+    """Return a layout with `config.resolutions` texels along the box's longest edge, and as many per length elsewhere.
+
+    The number of time rows is the same at every scale (K-Planes, section 3.1). No axis has fewer than two texels.
+    """
+    edges = np.asarray(aabb[1] - aabb[0], np.float64)
+    if is_dynamic and config.moving_area is not None:
+        return _plan_moving_area(config, np.reshape(config.moving_area, (2, 3)), edges, clip)
+    rows = time_rows(clip.frame_count, config.frames_per_row) if is_dynamic else 0
+    resolution = [[max(2, round(n * e / edges.max())) for e in edges] + [rows] for n in config.resolutions]
+    return Layout.of(np.array(resolution), config.channels)
+
+
+def _plan_moving_area(config: TrainConfig, area: np.ndarray, edges: np.ndarray, clip: Clip) -> Layout:
+    """Return a layout of scales without space-time planes, each followed by one with them over the area (2, 3)."""
+    rows = time_rows(clip.frame_count, max(1.0, config.frames_per_row / config.moving_rows))
+    resolution, spans = [], []
+    for n in config.resolutions:
+        whole = [max(2, round(n * e / edges.max())) for e in edges]
+        resolution.append([*whole, 0])
+        spans.append([[0, count] for count in whole])
+        texel = max(((area[1] - area[0]) * edges).max() / (config.moving_texels * n), edges.max() / (MOST_FINER * n))
+        whole = [max(3, round(e / texel)) for e in edges]
+        resolution.append([*whole, rows])
+        low, high = (area * (np.array(whole) - 1)).round(6)
+        first = np.maximum(np.floor(low) - 1, 0).astype(int)
+        last = np.minimum(np.ceil(high) + 1, np.array(whole) - 1).astype(int)
+        spans.append(np.stack([first, last - first + 1], axis=1).tolist())
+    return Layout.of(np.array(resolution), config.channels, np.array(spans))
+
+
+def time_rows(frame_count: int, frames_per_row: float) -> int:
+    """Return the number of rows of the space-time planes."""
+    return max(2, math.ceil(frame_count / frames_per_row))
+
+
+def motion_grid_shape(config: TrainConfig, aabb: np.ndarray, layout: Layout) -> tuple[int, int, int, int] | None:
+    """Return the nodes of the motion grid along t, z, y and x, or None where there is none.
+
+    Along t there is one for each row of the space-time planes; cells are as nearly cubes as whole numbers allow.
+    """
+    if not config.motion_cells or not layout.is_dynamic:
+        return None
+    nz, ny, nx = grid_shape(aabb, config.motion_cells)
+    return int(layout.resolution[:, 3].max()), nz + 1, ny + 1, nx + 1
+
+
+def border_elements(layout: Layout) -> np.ndarray:
+    """Return the elements of theta (n,) that stay 0: outermost texels of space planes where the box goes on beyond."""
+    elements = np.arange(layout.size).reshape(-1, layout.channels)
+    found = [np.zeros(0, np.int64)]
+    for s, name, start, rows, columns in layout.planes():
+        if name in TIME_PLANES:
+            continue
+        texels = elements[start // layout.channels :][: rows * columns].reshape(rows, columns, -1)
+        for axis, lines in zip(map(AXES.index, name), (texels.swapaxes(0, 1), texels), strict=True):
+            first, held = layout.first[s, axis], layout.held[s, axis]
+            found += [lines[0].ravel()] * bool(first > 0)
+            found += [lines[-1].ravel()] * bool(first + held < layout.resolution[s, axis])
+    return np.unique(np.concatenate(found))
