@@ -113,7 +113,7 @@ def quantise_plane(
     step = np.broadcast_to(np.asarray(step, np.float32), (channels,)).copy()
     needed = np.ones((rows, columns), bool) if needed is None else needed.astype(bool)
     held = held_texels(values)
-    if empty := not identity and not held.all():
+    if empty := not identity and held.any() and not held.all():
         needed &= held
     wanted = values[needed].astype(np.float64)  # (needed texels, M)
     if not (np.abs(wanted) <= VALUE_LIMIT / 2).all():

@@ -58,7 +58,7 @@ def test_a_step_that_fits_is_kept_and_one_that_does_not_is_just_large_enough():
 
 def test_a_space_plane_rests_on_its_mean_and_moves_off_it_only_to_fit():
     values = np.zeros((10, 10, 1), np.float32)
-    values[0, 0] = 2.0
+    values[0, 0], values[-1, -1] = 2.0, 1e-6  # its edges are not empty
     assert quantise_plane(values, 0.1, identity=False).offset == pytest.approx(0.02, rel=2**-7)
     moved = quantise_plane(values, 0.01, identity=False)  # 200 steps of range: the top must be 127 steps up
     assert moved.offset == pytest.approx(2.0 - 1.27)
