@@ -118,6 +118,20 @@ def fit_device_coordinates(pictures: Pictures) -> tuple[DeviceCoordinates, np.nd
     return mapping, np.stack([coordinates.min(0), coordinates.max(0)]).astype(np.float32)
 
 
+def cell_centres(shape: tuple[int, int, int]) -> np.ndarray:
+    """Return the centres of the cells of an (Nz, Ny, Nx) grid over the planes, (Nz Ny Nx, 3) x, y, z in [0, 1]."""
+    z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n for n in shape), indexing="ij")
+    return np.stack([x, y, z], axis=-1).reshape(-1, 3)
+
+
+def world_points(points: np.ndarray, aabb: np.ndarray, mapping: SpaceMapping | None) -> np.ndarray:
+    """Return the world coordinates (N, 3) of points of the planes, (N, 3) in [0, 1]."""
+    if isinstance(mapping, Contraction):
+        return uncontract(points, aabb)
+    inside: np.ndarray = aabb[0] + points * (aabb[1] - aabb[0])
+    return inside if mapping is None else mapping.to_world(inside)
+
+
 def visible_cells(
     pictures: Pictures,
     aabb: np.ndarray,
@@ -135,15 +149,7 @@ def visible_cells(
         shape: Nz, Ny, Nx.
         at_least: distinct cameras that must see a cell; all of them if there are fewer.
     """
-    nz, ny, nx = shape
-    low, edges = (np.zeros(3), np.ones(3)) if isinstance(mapping, Contraction) else (aabb[0], aabb[1] - aabb[0])
-    axes = [low[a] + (np.arange(n) + 0.5) / n * edges[a] for a, n in enumerate((nx, ny, nz))]
-    z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
-    centres = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    if isinstance(mapping, Contraction):
-        centres = uncontract(centres, aabb)
-    elif mapping is not None:
-        centres = mapping.to_world(centres)
+    centres = world_points(cell_centres(shape), aabb, mapping)
     cameras = _distinct_cameras(pictures)
     focus = _focus(pictures, cameras)
     poses = pictures.camera_to_world[cameras, :3].astype(np.float64)

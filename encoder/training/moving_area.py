@@ -11,9 +11,10 @@ import numpy as np
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.datasets.rays import covering_pinholes
 from kpc.encoder.evaluation.moving import MovingPixels
+from kpc.encoder.field.bounds import cell_centres, world_points
 from kpc.encoder.field.occupancy_grid import dilate
 from kpc.encoder.training.importance import has_static_cameras
-from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping, uncontract
+from kpc.format.scene.space import SpaceMapping
 
 # Points along each axis, and times, at which the visual hull of what moves is found.
 POINTS, TIMES = 64, 12
@@ -58,9 +59,8 @@ def find_moving_area(dataset: Dataset, aabb: np.ndarray, mapping: SpaceMapping |
     """
     if not has_static_cameras(dataset):
         return None, "cameras move, or show one picture each"
-    z, y, x = ((axis.ravel() + 0.5) / POINTS for axis in np.indices((POINTS, POINTS, POINTS)))
-    points = np.stack([x, y, z], axis=1)
-    is_hull = _hull(dataset, _world(points, aabb, mapping))
+    points = cell_centres((POINTS, POINTS, POINTS))
+    is_hull = _hull(dataset, world_points(points, aabb, mapping))
     hull = points[is_hull]
     if not len(hull):
         return None, "no point is seen to move by several cameras"
@@ -71,14 +71,6 @@ def find_moving_area(dataset: Dataset, aabb: np.ndarray, mapping: SpaceMapping |
         return None, f"things move in {share:.0%} of the space"
     box = tuple(np.concatenate([low, high]).round(4).tolist())
     return MovingArea(box, is_hull.reshape(POINTS, POINTS, POINTS)), f"things move in {share:.0%} of the space"
-
-
-def _world(points: np.ndarray, aabb: np.ndarray, mapping: SpaceMapping | None) -> np.ndarray:
-    """Return world coordinates (N, 3) of points of the planes in [0, 1]^3."""
-    if isinstance(mapping, Contraction):
-        return uncontract(points, aabb)
-    inside = aabb[0] + points * (aabb[1] - aabb[0])
-    return mapping.to_world(inside) if isinstance(mapping, DeviceCoordinates) else inside
 
 
 def _hull(dataset: Dataset, points: np.ndarray) -> np.ndarray:

@@ -112,8 +112,8 @@ def quantise_plane(
     rows, columns, channels = values.shape
     step = np.broadcast_to(np.asarray(step, np.float32), (channels,)).copy()
     needed = np.ones((rows, columns), bool) if needed is None else needed.astype(bool)
-    held = held_texels(values)
-    if empty := not identity and held.any() and not held.all():
+    is_part = not identity and 0 < np.count_nonzero(held := held_texels(values)) < held.size
+    if is_part:
         needed &= held
     wanted = values[needed].astype(np.float64)  # (needed texels, M)
     if not (np.abs(wanted) <= VALUE_LIMIT / 2).all():
@@ -126,7 +126,7 @@ def quantise_plane(
     step = np.minimum(step, np.float32(COARSEST_STEP))
 
     low, high = (wanted.min(0), wanted.max(0)) if len(wanted) else (np.ones(channels), np.ones(channels))
-    if empty:
+    if is_part:
         offset = np.zeros(channels, np.float32)
         step = _at_least(step, np.maximum(high / SYMBOL_MAX, low / SYMBOL_MIN))
     elif identity:
