@@ -10,7 +10,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.resources import files
 
@@ -159,10 +159,11 @@ def _loaded() -> tuple[wasmtime.Engine, wasmtime.Module]:
 
 @cache
 def _engine() -> wasmtime.Engine:
-    """Return an engine whose epoch a thread counts up. It caches compiled modules on disk."""
+    """Return an engine whose epoch a thread counts up. It caches compiled modules on disk where it may write there."""
     config = wasmtime.Config()
     config.epoch_interruption = True
-    config.cache = True
+    with suppress(wasmtime.WasmtimeError):  # no home folder, or a read-only one: each process compiles for itself
+        config.cache = True
     engine = wasmtime.Engine(config)
 
     thread = threading.Thread(target=count_epochs, args=(engine.increment_epoch,), daemon=True)

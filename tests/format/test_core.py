@@ -111,6 +111,13 @@ def test_both_modules_decode_the_same(monkeypatch):
         np.testing.assert_array_equal(one, other)
 
 
+def test_no_home_folder_is_needed(monkeypatch, tmp_path):
+    (tmp_path / "file").write_bytes(b"")  # below which no folder can be made
+    for name in "HOME", "XDG_CACHE_HOME", "USERPROFILE":
+        monkeypatch.setenv(name, str(tmp_path / "file" / "home"))
+    assert core._compiled.__wrapped__(core._engine.__wrapped__()).exports
+
+
 def test_memory_is_that_of_the_budget(monkeypatch):
     monkeypatch.setattr(decoding, "CORE_BYTES", 2 << 20)
     monkeypatch.setattr(core, "_idle", [])
