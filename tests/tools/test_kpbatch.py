@@ -135,6 +135,30 @@ def test_a_fault_is_a_line(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    "words, fault",
+    [
+        (["-o", "mine.kpc"], "--output: a batch sets"),
+        (["--outp=mine.kpc"], "--output: a batch sets"),
+        (["--keep-checkpoint", "mine.kpck"], "--keep-checkpoint: a batch sets"),
+        (["--dry-run"], "--dry-run: a batch sets"),
+        (["--js"], "--json: a batch sets"),
+        (["--help"], "--help and --version: a batch sets"),
+    ],
+)
+def test_words_of_a_batch_are_its_own(
+    take: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], fault: str
+) -> None:
+    assert main([str(take), "-o", str(tmp_path / "out"), "--", *words]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith(f"kpbatch: {take}: {fault}") and said.err.count("\n") == 1 and not said.out
+
+
+def test_an_abbreviated_group_is_one(take: Path) -> None:
+    (job,) = jobs.jobs_of_folders([str(take)], ["--gro", "10s"], Resources())
+    assert job.group
+
+
 def test_all_faults_are_found_at_once(tmp_path: Path, take: Path) -> None:
     text = 'output = "out"\nx = 1\n[options]\npreset = "quick"\n[[scene]]\nsource = "take"\n[[scene]]\nsource = "no"\n'
     with pytest.raises(FaultyBatch) as error:

@@ -18,7 +18,7 @@ import itertools
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,10 @@ from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
 from kpc.tools.batch.toml_lines import TomlLines
 
-# Options of kpenc that a batch sets itself, or that make no sense in one.
-REFUSED = ("output", "o", "work", "keep", "resume", "dry-run", "json", "only", "preview", "keep-checkpoint", "version")
+# Options of kpenc that a batch sets itself, or that make no sense in one: fields of kpenc's options, and all others.
+REFUSED_FIELDS = ("output", "work", "keep", "resume", "only", "preview", "keep_checkpoint")
+REFUSED = (*REFUSED_FIELDS, "o", "dry_run", "json", "version", "help", "h")
+A_BATCHS_OWN = "a batch sets this option of kpenc itself; drop it"
 TABLES = {"options", "grid", "resources"}
 SCENE_KEYS = {"source", "name", "options", "resources"}
 ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
@@ -150,8 +152,8 @@ def jobs_of_folders(folders: Sequence[str], options: Sequence[str], resources: R
         if not ADDRESS.match(source) and not Path(source).exists():
             faults.add(folder, "no such file or folder")
             continue
-        jobs.append(Job(name_of(source), source, tuple(options), _has(options, "--group"), resources, folder))
-        _check_job(jobs[-1], faults)
+        job = Job(name_of(source), source, tuple(options), resources=resources, where=folder)
+        jobs.append(_checked(job, faults))
     _check_names(jobs, faults)
     faults.check()
     return tuple(jobs)
@@ -225,9 +227,7 @@ def _jobs_of(
         options = common["options"] | chosen | own
         parts = [name, *(f"{key}-{UNSAFE.sub('_', str(value))}" for key, value in chosen.items())]
         words = _words(options, number, lines, faults)
-        job = Job(".".join(parts), source, words, "group" in options, resources, where)
-        _check_job(job, faults)
-        yield job
+        yield _checked(Job(".".join(parts), source, words, resources=resources, where=where), faults)
 
 
 def _words(options: Mapping[str, Any], number: int, lines: TomlLines, faults: Faults) -> tuple[str, ...]:
@@ -235,8 +235,8 @@ def _words(options: Mapping[str, Any], number: int, lines: TomlLines, faults: Fa
     words = []
     for key, value in options.items():
         name = key.replace("_", "-")
-        if name in REFUSED:
-            faults.add(lines.of(key, number), f"{key}: a batch sets this option of kpenc itself; drop it")
+        if name.replace("-", "_") in REFUSED:
+            faults.add(lines.of(key, number), f"{key}: {A_BATCHS_OWN}")
         elif value is True:
             words.append(f"--{name}")
         elif isinstance(value, list) and value and all(isinstance(one, int | float) for one in value):
@@ -268,24 +268,32 @@ def _resources(given: Mapping[str, Any], where: str, faults: Faults) -> Resource
     return Resources(counts["cores"], memory, counts["gpus"])
 
 
-def _check_job(job: Job, faults: Faults) -> None:
-    """Check the options by kpenc's own parser, and that a folder on this machine holds something to encode."""
+def _checked(job: Job, faults: Faults) -> Job:
+    """Check a job's options by kpenc's own parser, and that a folder on this machine holds something to encode; return
+    the job with what they say about groups."""
     from kpc.encoder.cli import options as kpenc  # loads PyTorch, which workers need not
     from kpc.encoder.cli.read_dataset import check_folder
 
-    source = "folder" if ADDRESS.match(job.source) and not job.source.endswith(".kpc") else job.source
     if ADDRESS.match(job.source) and job.source.endswith(".kpc"):
-        return  # its options are checked once the file is there
-    said = io.StringIO()
+        return job  # its options are checked once the file is there
+    source, said = "folder" if ADDRESS.match(job.source) else job.source, io.StringIO()
+    output = Path(".kpbatch", "scene.kpc")
     try:
-        with contextlib.redirect_stderr(said):
-            options, *_ = kpenc.parse([source, "-o", "scene.kpc", *job.options])
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            options, is_plan, is_json = kpenc.parse([source, "-o", str(output), *job.options])
+        plain = kpenc.Options(options.source, output)
+        given = [name for name in REFUSED_FIELDS if getattr(options, name) != getattr(plain, name)]
+        for name in given + ["dry_run"] * is_plan + ["json"] * is_json:
+            faults.add(job.where, f"--{name.replace('_', '-')}: {A_BATCHS_OWN}")
         if not ADDRESS.match(job.source) and options.source.is_dir():
             check_folder(options)
-    except SystemExit:
-        faults.add(job.where, said.getvalue().strip().rsplit("error: ", 1)[-1])
+        return replace(job, group=options.group_s is not None)
+    except SystemExit as stop:
+        message = said.getvalue().strip().rsplit("error: ", 1)[-1]
+        faults.add(job.where, message if stop.code else f"--help and --version: {A_BATCHS_OWN}")
     except KpcError as error:
         faults.add(job.where, str(error))
+    return job
 
 
 def _check_names(jobs: Sequence[Job], faults: Faults) -> None:
@@ -294,7 +302,3 @@ def _check_names(jobs: Sequence[Job], faults: Faults) -> None:
         other = first.setdefault(job.name, job)
         if other is not job:
             faults.add(job.where, f"the name {job.name!r} is taken by {other.where}; give the scene another name")
-
-
-def _has(options: Sequence[str], name: str) -> bool:
-    return any(word == name or word.startswith(f"{name}=") for word in options)
