@@ -11,7 +11,7 @@ from kpc.encoder.cli.encode_scene import encode_scene, handle_signals
 from kpc.encoder.cli.estimate import Estimate, estimate
 from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group
 from kpc.encoder.cli.options import ALL_VIEWS, Options, parse
-from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer
+from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer, working_alone
 from kpc.encoder.cli.read_dataset import read_dataset
 from kpc.encoder.cli.report import print_estimate, print_result
 from kpc.encoder.cli.transcode import transcode
@@ -51,9 +51,10 @@ def encode(options: Options) -> dict[str, Any]:
         TrainingError: training failed, or the file cannot be written.
         KeyboardInterrupt: stopped by the user; the checkpoint is kept.
     """
-    if options.group_s is not None:
-        return encode_groups(options)
-    return encode_scene(options, prepare_setting(options))
+    with working_alone(options):
+        return (
+            encode_groups(options) if options.group_s is not None else encode_scene(options, prepare_setting(options))
+        )
 
 
 def dry_run(options: Options) -> Estimate:
@@ -62,7 +63,7 @@ def dry_run(options: Options) -> Estimate:
     Nothing is left in the work folder that was not there before; with `options.keep` or `options.cache`, decoded pixels
     are. Raises as `encode`.
     """
-    with contextlib.nullcontext() if options.keep else leaving_nothing(options.work_dir):
+    with working_alone(options), contextlib.nullcontext() if options.keep else leaving_nothing(options.work_dir):
         return _dry_run(options)
 
 

@@ -1,6 +1,8 @@
 """Preparation of an encode: decode the dataset, find the space that it fills, lay out the model, resume a run."""
 
+import contextlib
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +13,7 @@ from kpc.encoder.cli.read_dataset import PAGE, read_dataset
 from kpc.encoder.cli.report import REFINED, SPACES, describe_model, describe_time_rows, log, show_progress
 from kpc.encoder.cli.sound import find_sound
 from kpc.encoder.cli.transcode import check_outputs
-from kpc.encoder.cli.work_folder import CHECKPOINT, POSES, choose_device, make_work_folder, remove_if_empty
+from kpc.encoder.cli.work_folder import CHECKPOINT, POSES, choose_device, locked, make_work_folder
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.datasets.plausibility import doubts
 from kpc.encoder.evaluation.camera_page import write_page_of_dataset
@@ -65,24 +67,31 @@ class Setting:
     refined: str = "none"
 
 
+@contextlib.contextmanager
+def working_alone(options: Options) -> Iterator[None]:
+    """Check that the outputs can be written, and hold the work folder.
+
+    Raises:
+        UsageError, TrainingError, OSError: one cannot, or another kpenc is at work there.
+    """
+    check_outputs(options)
+    with locked(options.work_dir):
+        yield
+
+
 def prepare_setting(options: Options) -> Setting:
     """Decode the dataset and find the space that it fills.
 
     Raises:
         DatasetError, MediaError: the dataset cannot be used.
-        UsageError, TrainingError: the outputs cannot be written, or the options contradict each other.
+        UsageError, TrainingError: the options contradict each other, or a folder cannot be made.
     """
-    check_outputs(options)
     choose_device(options.device)
     make_work_folder(options.work_dir, options.cache)
-    try:
-        dataset = read_dataset(options)
-        aabb, mapping, why = _find_space(dataset, options)
-        sound, sound_from = find_sound(options, dataset)
-        options.trade.check_size(sound)
-    except BaseException:
-        remove_if_empty(options.work_dir)
-        raise
+    dataset = read_dataset(options)
+    aabb, mapping, why = _find_space(dataset, options)
+    sound, sound_from = find_sound(options, dataset)
+    options.trade.check_size(sound)
     log(dataset.describe())
     log(f"pixels: {dataset.pixels.describe()}")
     for doubt in doubts(dataset):

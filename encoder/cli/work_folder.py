@@ -7,11 +7,13 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 import torch
+from filelock import FileLock, Timeout
 
 from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.container import rewriting
 
 CHECKPOINT = "checkpoint.kpck"
+LOCK = ".kpenc.lock"
 POSES = "poses"  # the folder of cameras found for footage without poses
 # The files of an encode in its work folder, but for decoded pixels.
 OWN_FILES = ("group-*.kpc", "group-*.json", "group-*.kpck", CHECKPOINT, f".{Path(CHECKPOINT).stem}.*")
@@ -31,6 +33,33 @@ def make_work_folder(work: Path, cache: Path | None = None) -> None:
             raise TrainingError(
                 f"{folder}: {error.strerror}; name another folder for decoded pixels with {option}"
             ) from error
+
+
+@contextlib.contextmanager
+def locked(work: Path) -> Iterator[None]:
+    """Hold the work folder, which is made, so that no other kpenc uses it and then removes what is in it.
+
+    The system releases the lock of a process that ends, however it ends.
+
+    Raises:
+        TrainingError: another process holds it, or it cannot be written.
+    """
+    make_work_folder(work)
+    lock = FileLock(work / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise TrainingError(
+            f"{work}: another kpenc is at work there; wait for it, or name another folder with --work"
+        ) from None
+    except PermissionError as error:
+        raise TrainingError(f"{work}: no permission to write there; name another folder with --work") from error
+    try:
+        yield
+    finally:
+        (work / LOCK).unlink(missing_ok=True)
+        lock.release()
+        remove_if_empty(work)
 
 
 def clear_work_folder(work: Path, cache: Path | None = None) -> None:
@@ -57,7 +86,7 @@ def is_own_file(path: Path, work: Path) -> bool:
 
 @contextlib.contextmanager
 def leaving_nothing(work: Path) -> Iterator[None]:
-    """Remove at the end, also after an error, what was put into the work folder meanwhile."""
+    """Remove at the end, also after an error, what was put into the locked work folder meanwhile."""
     before = set(work.glob("*"))
     try:
         yield
@@ -67,7 +96,6 @@ def leaving_nothing(work: Path) -> Iterator[None]:
                 shutil.rmtree(leftover)
             else:
                 leftover.unlink(missing_ok=True)
-        remove_if_empty(work)
 
 
 def remove_if_empty(work: Path) -> None:

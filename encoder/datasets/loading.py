@@ -95,9 +95,12 @@ def load_dataset(
         dataset = _load(root, capture, masks, Path(cache_dir), downscale, progress)
         return replace(dataset, left_out=left_out)
     except PermissionError as error:
-        raise DatasetError(
-            f"{error.filename or root}: no permission to read it; change its permissions or run as its owner"
-        ) from error
+        file = Path(error.filename or root)
+        if file.is_relative_to(cache_dir):
+            remedy = "no permission to write there; name another folder with --cache"
+        else:
+            remedy = "no permission to read it; change its permissions or run as its owner"
+        raise DatasetError(f"{file}: {remedy}") from error
     except (DatasetError, MediaError) as error:
         if str(error).isprintable():
             raise
