@@ -18,12 +18,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from filelock import FileLock
 
 import datasets as make
 import quick_coding
 from kpc.encoder.cli import kpenc
-from kpc.encoder.cli.work_folder import CHECKPOINT, LOCK
+from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.datasets import pixel_cache
 from kpc.encoder.evaluation.preview import Preview
 from kpc.encoder.field.config import PRESETS
@@ -603,32 +602,6 @@ def test_outputs_that_cannot_be_written(run: Kpenc, sets: Path, tmp_path: Path) 
         )
     (tmp_path / "plain").write_text("")
     fails(run, tmp_path, sets / "n3dv", str(tmp_path / "plain"), "--work", options=("--work", str(tmp_path / "plain")))
-
-
-@pytest.mark.parametrize("options", [(), ("--dry-run",)])
-def test_a_work_folder_of_another_run(run: Kpenc, sets: Path, tmp_path: Path, options: tuple[str, ...]) -> None:
-    """The other run would remove what this one keeps there, and this one what it does."""
-    work = tmp_path / "out.kpc.work"
-    work.mkdir()
-    with FileLock(work / LOCK):
-        fails(run, tmp_path, sets / "n3dv", str(work), "another kpenc is at work there", "--work", options=options)
-        assert [path.name for path in work.iterdir()] == [LOCK]
-
-
-@pytest.mark.parametrize("option", ["--work", "--cache"])
-def test_folders_without_permission(
-    run: Kpenc, sets: Path, tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    acquire = FileLock.acquire
-
-    def refuse(self: FileLock, **options: float) -> object:
-        if Path(self.lock_file).parent.name == "folder":
-            raise PermissionError(errno.EACCES, "Permission denied", self.lock_file)
-        return acquire(self, **options)
-
-    monkeypatch.setattr(FileLock, "acquire", refuse)
-    folder = str(tmp_path / "folder")
-    fails(run, tmp_path, sets / "n3dv", folder, "no permission to write there", option, options=(option, folder))
 
 
 @pytest.mark.parametrize(
