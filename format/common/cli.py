@@ -16,7 +16,7 @@ from typing import Any
 
 from kpc.format.common import interrupts
 from kpc.format.common.errors import KpcError, UsageError
-from kpc.format.common.text import valid_unicode
+from kpc.format.common.text import one_line, valid_unicode
 from kpc.format.common.version import VERSION
 
 # Packages that only some extras bring, with one that does.
@@ -101,7 +101,9 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def _fail(name: str, message: str, code: int) -> int:
-    print(f"{name}: {' '.join(message.split())}", file=sys.stderr)
+    # Names of files may hold control codes, which a terminal would obey.
+    line = re.sub(r"[\x00-\x1f\x7f-\x9f]", lambda code: one_line(code[0]), " ".join(message.split()))
+    print(f"{name}: {line}", file=sys.stderr)
     return code
 
 

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO
 
+from kpc.format.common.errors import MediaError
+
 # Byte order marks and their encodings; that of UTF-32 begins as that of UTF-16 does.
 _BYTE_ORDER_MARKS = (
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -40,6 +42,18 @@ def open_text(path: str | os.PathLike[str]) -> TextIO:
 def valid_unicode(text: str | os.PathLike[str]) -> str:
     """Return text with a replacement character (U+FFFD) for each surrogate."""
     return re.sub("[\ud800-\udfff]", "\ufffd", os.fspath(text))
+
+
+def check_unicode(path: str | os.PathLike[str], format_name: str) -> None:
+    """Refuse a path that a library cannot open, since it takes text.
+
+    Raises:
+        MediaError: the path is not valid Unicode.
+    """
+    if valid_unicode(path) != os.fspath(path):
+        raise MediaError(
+            f"{os.fspath(path)}: {format_name} files need names that are valid Unicode; choose another name"
+        )
 
 
 def counted(count: int, noun: str) -> str:

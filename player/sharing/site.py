@@ -16,6 +16,7 @@ from urllib.parse import quote, urljoin
 
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import valid_unicode
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Clip
 
@@ -255,4 +256,4 @@ def _page(
 
 
 def _filled(template: str, **values: str) -> str:
-    return Template((files(__package__) / template).read_text()).substitute(values)
+    return valid_unicode(Template((files(__package__) / template).read_text()).substitute(values))

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from kpc.format.common import cli
-from kpc.format.common.text import counted, first_names, open_text, valid_unicode
+from kpc.format.common.errors import MediaError
+from kpc.format.common.text import check_unicode, counted, first_names, open_text, valid_unicode
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-32"])
@@ -35,6 +36,20 @@ def test_numbers_and_names_in_messages() -> None:
 def test_valid_unicode() -> None:
     assert valid_unicode("a\udce9b\ud800 é 😀") == "a\ufffdb\ufffd é 😀"
     assert valid_unicode(Path("caf\udce9")) == "caf\ufffd"
+
+
+def test_paths_for_libraries_that_take_text() -> None:
+    check_unicode(Path("é/ü.exr"), "EXR")
+    with pytest.raises(MediaError, match="EXR files need names that are valid Unicode"):
+        check_unicode(Path("caf\udce9") / "a.exr", "EXR")
+
+
+def test_terminals_obey_no_name(capsys: pytest.CaptureFixture[str]) -> None:
+    def command(argv: list[str]) -> None:
+        raise FileNotFoundError(2, "No such file or directory", "a\x1b[31m\x9bé")
+
+    assert cli.run(command, "kpx", []) == 1
+    assert capsys.readouterr().err == "kpx: a\\x1b[31m\\x9bé: No such file or directory\n"
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])

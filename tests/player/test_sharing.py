@@ -4,6 +4,7 @@ import hashlib
 import re
 import shutil
 import urllib.request
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -69,6 +70,11 @@ def test_texts_of_a_file_are_never_markup() -> None:
     plain, attacked = Page(site.scene_page(shared(author="A"))), Page(site.scene_page(hostile))
     assert attacked.tags == plain.tags and attacked.content("og:title") == HOSTILE
     assert Page(site.gallery_page({"a": hostile}, HOSTILE)).tags == Page(site.gallery_page({"a": shared()}, "g")).tags
+
+
+def test_a_name_that_is_no_unicode_is_shown_with_its_letters_replaced() -> None:
+    page = site.scene_page(replace(shared(), name="caf\udce9"))
+    assert "<title>caf\ufffd</title>" in page and page.encode()
 
 
 def test_a_published_address_makes_link_previews_whole() -> None:

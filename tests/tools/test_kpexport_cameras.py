@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -113,6 +114,17 @@ def test_a_gltf_camera_is_valid_and_can_be_edited(tmp_path: Path) -> None:
     assert view.at_s is None and (view.camera.width, view.camera.height) == (480, 360)
     assert np.abs(view.camera.camera_to_world[:3, 3] - (2 * np.array(EYES[0]) + [1, 0, 0])).max() < TOLERANCE
     assert math.isclose(view.camera.fl_x, 550, rel_tol=TOLERANCE) and math.isclose(view.camera.fl_y, 500)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names of files are Unicode")
+def test_names_that_usd_cannot_have_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed, which reads and writes USD")
+    save_views(tmp_path / "in.json", views(False))
+    odd = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.usda")
+    for words in (tmp_path / "in.json", odd), (odd, tmp_path / "out.json"):
+        Path(words[0]).touch()
+        assert kpexport.main([str(words[0]), "-o", str(words[1])]) == 1
+        assert capsys.readouterr().err.endswith("USD files need names that are valid Unicode; choose another name\n")
 
 
 def test_usd_of_other_programs_is_turned_and_scaled(tmp_path: Path) -> None:

@@ -215,6 +215,12 @@ def test_a_file_whose_end_is_missing_is_described_but_not_verified(scene_file, c
     assert (file["size_bytes"], file["expected_bytes"]) == (len(cut), len(data)) and not file["verified"]
 
 
+def test_control_codes_of_names_are_escaped(capsys):
+    assert kpinfo.main(["\x1b[1m.kpc", "none.kpc"]) == 1
+    printed, errors = capsys.readouterr()
+    assert "  \\x1b[1m.kpc  (not read)" in printed and "\x1b" not in printed + errors
+
+
 def test_several_files_with_totals(scene_file, tmp_path, capsys):
     other, cut, size = tmp_path / "other.kpc", tmp_path / "cut.kpc", scene_file.stat().st_size
     other.write_bytes(scene_file.read_bytes())

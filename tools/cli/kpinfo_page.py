@@ -53,7 +53,7 @@ def table(files: Sequence[Mapping[str, Any]], totals: Mapping[str, Any]) -> str:
         is_cut = clip is not None and size < info["expected_bytes"]
         state = "  (not read)" if clip is None else "  (damaged)" if info["error"] else ""
         state = f"  (cut off from {info['expected_bytes']:,})" if is_cut else state
-        lines.append("  ".join([*columns, info["file"] + state]))
+        lines.append("  ".join([*columns, one_line(info["file"]) + state]))
     verified = ", all verified" if all(info["verified"] for info in files) else ""
     failed = f", {totals['failed']} failed" if totals["failed"] else ""
     columns = [f"{totals['size_bytes']:>15,}", _columns(totals, "", totals["groups"])]

@@ -17,6 +17,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom
 
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import DatasetError, MediaError
+from kpc.format.common.text import check_unicode
 from kpc.format.scene.camera_checks import check_lens, check_pose
 from kpc.format.scene.cameras import Camera, View
 from kpc.tools.exchange.camera_tracks import MAX_VIEWS, Track, size_for
@@ -37,6 +38,7 @@ def write_usd_cameras(path: Path, tracks: Sequence[Track], fps: float) -> None:
     Raises:
         MediaError, OSError: the file cannot be written.
     """
+    check_unicode(path, "USD")
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -72,7 +74,9 @@ def read_usd_cameras(path: Path, size: tuple[int, int] | None) -> tuple[list[Tra
 
     Raises:
         DatasetError: the file is malformed or refers to others, or a camera cannot be rendered.
+        MediaError: its name is not valid Unicode.
     """
+    check_unicode(path, "USD")
     if not path.is_file():
         raise DatasetError(f"{path}: no such file, or not a regular one; check the path")
     if path.stat().st_size > MAX_FILE_BYTES:

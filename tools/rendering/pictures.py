@@ -13,6 +13,7 @@ from PIL import Image
 from kpc.format.common import cli
 from kpc.format.common.errors import MediaError
 from kpc.format.common.images import image_info, read_image, write_image
+from kpc.format.common.text import check_unicode
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction
@@ -87,6 +88,7 @@ def _write_exr(path: Path, picture: Rendering, is_transparent: bool) -> None:
     there is no surface. Over a background A is 1."""
     import OpenEXR
 
+    check_unicode(path, "EXR")
     rgb = linear_colours(picture, is_transparent).astype(np.float32)
     alpha = np.clip(picture.opacity, 0, 1) if is_transparent else np.ones_like(picture.opacity)
     rgba = np.ascontiguousarray(np.concatenate([rgb, alpha[..., None]], axis=2), np.float32)
