@@ -100,10 +100,14 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def _fail(name: str, message: str, code: int) -> int:
-    # Names of files may hold control codes, which a terminal would obey.
+def print_error(name: str, message: str) -> None:
+    """Print an error of a command as one line on stderr; control codes, which a terminal would obey, as escapes."""
     line = re.sub(r"[\x00-\x1f\x7f-\x9f]", lambda code: one_line(code[0]), " ".join(message.split()))
     print(f"{name}: {line}", file=sys.stderr)
+
+
+def _fail(name: str, message: str, code: int) -> int:
+    print_error(name, message)
     return code
 
 

@@ -39,7 +39,7 @@ def _command(argv: list[str]) -> None:
     except FaultyBatch as error:
         *others, last = error.faults
         for fault in others:
-            print(f"kpbatch: {fault}", file=sys.stderr)
+            cli.print_error("kpbatch", fault)
         raise UsageError(last) from error
     shared = f"{batch.output.rstrip('/')}/{SHARED}"
     store, output = Store(shared), Store(batch.output)

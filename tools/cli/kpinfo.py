@@ -42,7 +42,7 @@ def _command(argv: list[str]) -> None:
         )
         files.append(info)
         if info["error"] is not None and not is_one:
-            print(f"kpinfo: {info['error']}", file=sys.stderr)
+            cli.print_error("kpinfo", info["error"])
     sums = totals(files)
     if options.json:
         cli.print_json({"schema": SCHEMA, "files": files, "totals": sums})
