@@ -142,6 +142,14 @@ def test_output_is_checked_before_the_work(
     assert caught.value.filename == str(tmp_path / name)
 
 
+def test_a_write_protected_file_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "master.kpc").touch(0o444)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).is_dir())  # as for all users but root
+    cli.check_writable(tmp_path / "new.kpc")
+    with pytest.raises(OSError, match="is write-protected; choose another name with --out"):
+        cli.check_writable(tmp_path / "master.kpc", option="--out")
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
 def test_a_pipe_is_refused_rather_than_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     os.mkfifo(tmp_path / "scene.kpc")

@@ -155,12 +155,14 @@ def check_writable(path: Path, *, is_folder: bool = False, option: str = "-o") -
 
     Raises:
         UsageError: a folder is missing, is a file, or has the name of the file.
-        OSError: there is no permission to write there; the error names `path`.
+        OSError: there is no permission to write there, or the file is write-protected; the error names `path`.
     """
     above = path.absolute()
     if not is_folder:
         if above.is_dir():
             raise UsageError(f"{path}: is a folder; give the name of a file")
+        if above.exists() and not os.access(above, os.W_OK):  # renaming would replace it all the same
+            raise OSError(errno.EACCES, f"is write-protected; choose another name with {option}", str(path))
         above = above.parent
     while is_folder and not above.exists() and above != above.parent:
         above = above.parent

@@ -588,7 +588,7 @@ def test_no_permission(run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pyte
         patch.setattr(builtins, "open", refusing)
         fails(run, tmp_path, sets / "n3dv", "poses_bounds.npy", "ermission")
     with monkeypatch.context() as patch:
-        patch.setattr(os, "access", lambda *_: False)
+        patch.setattr(os, "access", lambda path, _: Path(path).is_file())
         fails(run, tmp_path, sets / "n3dv", str(tmp_path), "no permission", "-o")
 
 
