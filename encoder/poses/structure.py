@@ -189,7 +189,8 @@ def _pairs(pictures: list[dict], steps: tuple[int, ...] | None) -> list[tuple[in
 def _run_worker(folder: Path) -> None:
     command = [sys.executable, "-m", "kpc.encoder.poses.colmap_worker", str(folder)]
     # Pairs are matched in threads of their own; those of the matrix product would only get in their way.
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    # COLMAP leaves its log in the folder of temporary files, which is that of the job, and removed with it.
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "TMPDIR": str(folder)}
     with (
         (folder / "log").open("w") as log,
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment) as process,

@@ -1,6 +1,7 @@
 """Cameras of bare videos: what a folder is taken for, structure from motion, the document and reading it back."""
 
 import json
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -34,10 +35,14 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def document(room: Path) -> dict:
-    """What `kpposes` writes about it."""
-    file = room.parent / "transforms.json"
-    assert kpposes.main([str(room), "-o", str(file), "--distance", "cam00,cam04=1.5"]) == 0
+def document(room: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
+    """What `kpposes` writes about it, and nothing else: COLMAP's log does not stay."""
+    file, temporary = room.parent / "transforms.json", tmp_path_factory.mktemp("temporary")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TMPDIR", str(temporary))
+        patch.setattr(tempfile, "tempdir", None)
+        assert kpposes.main([str(room), "-o", str(file), "--distance", "cam00,cam04=1.5"]) == 0
+    assert not list(temporary.iterdir())
     return json.loads(file.read_text())
 
 
