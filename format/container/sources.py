@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, Protocol, runtime_checkable
 
-from kpc.format.common.errors import NetworkError
+from kpc.format.common.errors import FormatError, NetworkError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.http_address import Address, is_url, lacks_scheme
 
@@ -110,6 +110,12 @@ class _BytesSource:
         """Do nothing: all bytes are in memory."""
 
 
+def _identity(file: BinaryIO) -> tuple[int, int]:
+    """Return what distinguishes an open file from one that replaces it under its name."""
+    status = os.fstat(file.fileno())
+    return status.st_dev, status.st_ino
+
+
 class _FileSource:
     """A seekable file object; a file known by its path is opened anew for each read."""
 
@@ -122,13 +128,15 @@ class _FileSource:
             if Path(self.name).is_fifo():  # opening it would wait for a writer, without a word
                 raise OSError(errno.ESPIPE, "is a pipe, and scenes are read in any order; save it to a file", self.name)
             with open(self.name, "rb") as opened:  # so that an unreadable file is reported here, not later
-                self.size = opened.seek(0, io.SEEK_END)
+                self.size, self._identity = opened.seek(0, io.SEEK_END), _identity(opened)
 
     def read_at(self, offset: int, length: int) -> bytes:
         if self.file is not None:
             self.file.seek(offset)
             return self.file.read(length)
         with open(self.name, "rb") as opened:
+            if _identity(opened) != self._identity or opened.seek(0, io.SEEK_END) < self.size:
+                raise FormatError(f"{self.name}: changed while it was read; open it again")
             opened.seek(offset)
             return opened.read(length)
 

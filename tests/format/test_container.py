@@ -178,6 +178,23 @@ def test_sources_of_every_kind(tmp_path):
     assert str(path) in Reader(path).name
 
 
+@pytest.mark.parametrize("change", ["replaced", "shortened", "appended to"])
+def test_a_file_that_changes_while_it_is_read_is_no_damaged_one(tmp_path, change):
+    data, path, other = pack(CHUNKS, 7), tmp_path / "a.kpc", tmp_path / "b.kpc"
+    path.write_bytes(data)
+    reader = Reader(path)
+    other.write_bytes(data)
+    if change == "replaced":
+        other.replace(path)
+    else:
+        path.write_bytes(data[:-1] if change == "shortened" else data + b"more")
+    if change == "appended to":  # a download goes on
+        assert reader.stored(0)
+        return
+    with pytest.raises(FormatError, match=r"a\.kpc: changed while it was read; open it again"):
+        reader.stored(0)
+
+
 def test_a_partial_file_gives_what_is_there():
     data = pack(CHUNKS, 7)
     cut = Reader(data).index[2].offset
