@@ -73,6 +73,15 @@ def test_errors_name_the_file_that_was_asked_for_not_the_one_written_aside(tmp_p
     assert caught.value.filename == str(tmp_path / "a.png")
 
 
+@pytest.mark.parametrize("letter", ["x", "é", "😀"])
+def test_names_may_be_as_long_as_the_system_permits(tmp_path: Path, letter: str) -> None:
+    path = tmp_path / (letter * (251 // len(letter.encode())) + ".kpc")
+    path.touch()
+    with cli.atomic_write(path) as aside:
+        aside.write_bytes(b"whole")
+    assert path.read_bytes() == b"whole"
+
+
 def test_errors_of_other_files_stay_as_they_are_while_one_is_written(tmp_path: Path) -> None:
     with pytest.raises(PermissionError) as caught, cli.atomic_write(tmp_path / "a.png"):
         raise PermissionError(errno.EACCES, "no", "b.png")

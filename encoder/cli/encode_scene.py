@@ -58,7 +58,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     trainer = prepare_trainer(options, setting)
     if options.preview is not None:
         log(f"preview: {options.preview}, with the box, beside what was filmed")
-    dataset, work, checkpoint = trainer.dataset, options.work_dir, options.work_dir / CHECKPOINT
+    checkpoint = options.work_dir / CHECKPOINT
     try:
         _train(trainer, checkpoint, options)
     except Abandoned:
@@ -67,9 +67,18 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         trainer.save(checkpoint)
         if not _wants_partial(trainer, checkpoint, may_ask=options.group_s is None):
             raise
+    try:
+        return _write(options, setting, trainer, started)
+    except KeyboardInterrupt:
+        if checkpoint.exists():
+            log(f"stopped after training; {checkpoint} is kept, go on with --resume")
+        raise
 
+
+def _write(options: Options, setting: Setting, trainer: Trainer, started: float) -> dict[str, Any]:
+    """Code a model that is trained, write the file and test it; return what was measured."""
     corrections = _align(trainer)
-    dataset = trainer.refined_dataset()
+    dataset, work = trainer.refined_dataset(), options.work_dir
     if trainer.config.summed:
         return _evaluate_unwritable(trainer, options, started)
     scene, pictures = to_scene(trainer), _select_cameras(dataset)

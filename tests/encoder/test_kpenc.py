@@ -340,7 +340,7 @@ def test_interrupted_while_writing(run: Kpenc, sets: Path, tmp_path: Path, monke
     monkeypatch.setattr(cli.os, "replace", _failing_for(tmp_path / "out.kpc", KeyboardInterrupt()))
     (tmp_path / "out.kpc").write_bytes(b"an earlier scene")
     code, _, err = run(sets / "blender", "--steps", "2")
-    assert code == 130 and err.endswith("kpenc: interrupted\n")
+    assert code == 130 and err.endswith("checkpoint.kpck is kept, go on with --resume\nkpenc: interrupted\n")
     assert {p.name for p in tmp_path.iterdir()} == {"out.kpc", "out.kpc.work"}
     assert (tmp_path / "out.kpc").read_bytes() == b"an earlier scene"
     monkeypatch.setattr(cli.os, "replace", os.rename)
