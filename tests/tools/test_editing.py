@@ -160,6 +160,22 @@ def test_a_part_shows_what_the_clip_shows_then(variant):
         assert np.array_equal(plane.symbols, whole.symbols[rows] * plane.coded[..., None])
 
 
+def test_planes_that_never_change_do_not_keep_a_clip_from_being_cut():
+    """As those of the scales that `kpenc --layers auto` gives to what stands still: two equal rows."""
+    whole = quantised(time=9)
+    still = {
+        name: replace(plane, symbols=plane.symbols[[0, 0]], coded=plane.coded[[0, 0]]) if name in TIME_PLANES else plane
+        for name, plane in whole.scales[0].items()
+    }
+    before = replace(whole, scales=(still, *whole.scales[1:]))
+    after, (since, until) = trimmed(before, 0.3, 0.6)
+    assert (since, until) == (0.25, 0.625)
+    for local in (0.0, 0.777):
+        time = (since + local * (until - since)) / before.clip.duration_s
+        expected, found = picture(before, before.cameras[0], time), picture(after, before.cameras[0], local)
+        assert found[0] == pytest.approx(expected[0], abs=1e-4)
+
+
 def test_the_whole_clip_stays_as_it_is_and_what_cannot_be_cut_is_refused():
     scene = quantised(time=5)
     assert common_rows(scene) == 4

@@ -91,8 +91,10 @@ def check_part(clip: Clip, start_s: float, end_s: float) -> None:
 
 
 def common_rows(scene: QuantisedScene) -> int:
-    """Return into how many equal parts the clip can be cut at rows that all planes and the motion grid have."""
-    counts = [len(plane.symbols) - 1 for scale in scene.scales for n, plane in scale.items() if n in TIME_PLANES]
+    """Return into how many equal parts the clip can be cut at rows that the motion grid and all planes have, but for
+    planes that are the same at all times, as those of scales for what stands still are."""
+    planes = [plane for scale in scene.scales for n, plane in scale.items() if n in TIME_PLANES]
+    counts = [len(plane.symbols) - 1 for plane in [p for p in planes if _changes(p)] or planes]
     if scene.motion is not None:
         counts.append(len(scene.motion.symbols) - 1)
     return math.gcd(*counts) if counts else 0
@@ -142,7 +144,14 @@ def trimmed(scene: QuantisedScene, start_s: float, end_s: float) -> tuple[Quanti
     return without_unread(part, scene.occupancy), (since_s, until_s)
 
 
+def _changes(plane: QuantisedPlane) -> bool:
+    """Return whether a time plane has rows that differ."""
+    return bool((plane.symbols != plane.symbols[:1]).any() or (plane.coded != plane.coded[:1]).any())
+
+
 def _rows(plane: QuantisedPlane, first: int, last: int, parts: int) -> QuantisedPlane:
+    if (len(plane.symbols) - 1) % parts:  # it is the same at all times
+        return plane
     each = (len(plane.symbols) - 1) // parts
     rows = slice(first * each, last * each + 1)
     return QuantisedPlane(plane.symbols[rows], plane.step, plane.offset, plane.coded[rows])
