@@ -1,5 +1,6 @@
 """kpbatch: jobs that are checked as a whole, results that are made once, and workers that are killed."""
 
+import contextlib
 import errno
 import json
 import os
@@ -157,6 +158,19 @@ def test_words_of_a_batch_are_its_own(
 def test_an_abbreviated_group_is_one(take: Path) -> None:
     (job,) = jobs.jobs_of_folders([str(take)], ["--gro", "10s"], Resources())
     assert job.group
+
+
+def test_ctrl_c_leaves_time_to_end_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which takes longer than a command has after Ctrl-C unless it has taken note."""
+    heard: list[bool] = []
+    monkeypatch.setattr(engine.interrupts, "heard", lambda: heard.append(True))
+    monkeypatch.setattr(engine, "LocalCluster", lambda **_: contextlib.nullcontext())
+    monkeypatch.setattr(engine, "Client", contextlib.nullcontext)
+    with engine.local_cluster(1, Resources()):
+        assert not heard
+    with pytest.raises(KeyboardInterrupt), engine.local_cluster(1, Resources()):
+        raise KeyboardInterrupt
+    assert heard
 
 
 def test_all_faults_are_found_at_once(tmp_path: Path, take: Path) -> None:

@@ -13,6 +13,7 @@ import dask
 import psutil
 from distributed import Client, Future, LocalCluster, as_completed, get_worker
 
+from kpc.format.common import interrupts
 from kpc.format.common.errors import KpcError
 from kpc.tools.batch.jobs import Resources
 from kpc.tools.batch.tasks import Outcome, Task
@@ -77,7 +78,11 @@ def local_cluster(workers: int, resources: Resources) -> Iterator[Client]:
         ) as cluster,
         Client(cluster) as client,
     ):
-        yield client
+        try:
+            yield client
+        except KeyboardInterrupt:
+            interrupts.heard()  # ending workers takes some seconds
+            raise
 
 
 @contextlib.contextmanager
