@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,14 @@ import numpy as np
 import pytest
 
 import datasets as make
+from kpc.encoder.cli.metadata import hash_dataset
 from kpc.encoder.coding.scene_writer import encode
 from kpc.encoder.datasets import load_dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate
 from kpc.encoder.evaluation.ground_truth import ground_truth
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container import groups, scene_io
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Scene
 from kpc.tools.bench import harness, kpbench, plot, quality, tables
 from scenes import tiny_scene, with_appearances
@@ -65,6 +68,17 @@ def test_the_command_measures_what_the_encoder_reports(
     printed = capsys.readouterr().err
     assert "cam00" in printed and max(map(len, printed.splitlines()[:-1])) <= 100
     assert "moving FLIP" in tables.markdown([record])
+
+
+def test_a_scene_of_other_files_is_compared_with_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make.write_n3dv(tmp_path / "set")
+    own = hash_dataset(load_dataset(tmp_path / "set", tmp_path / "cache", progress=False))
+    for sha256, downscale, warns in ((own, 1, False), ("0" * 64, 1, True), ("0" * 64, 2, False)):
+        metadata = Metadata({"provenance": {"dataset_sha256": sha256}})
+        (tmp_path / "a.kpc").write_bytes(coded(replace(tiny_scene(), metadata=metadata)))
+        job = quality.Job(tmp_path / "a.kpc", tmp_path / "set", downscale=downscale)
+        quality.dataset_of(job, tmp_path / "cache")
+        assert ("a.kpc was made from other files than those of set" in capsys.readouterr().err) == warns
 
 
 def test_the_table_fits_whatever_the_clip() -> None:

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from kpc.encoder.datasets import load_dataset
 from kpc.encoder.evaluation.evaluate import Comparison
 from kpc.encoder.evaluation.moving import MovingPixels
 from kpc.format.common.errors import DatasetError
 from kpc.format.container.groups import Groups
 from kpc.tools.bench.group_joins import Shown
-from kpc.tools.bench.quality import Job, held_out_frames
+from kpc.tools.bench.quality import Job, dataset_of, held_out_frames
 
 MOST_ACROSS = 640  # pixels of a picture that is kept; larger ones are averaged
 QUALITY = 85  # of WebP
@@ -36,7 +35,7 @@ def measure(job: Job) -> dict[str, Any]:
         KpcError: the scene or the dataset cannot be used, or it holds out no picture.
     """
     with tempfile.TemporaryDirectory(prefix="kpbench-") as work:
-        dataset = load_dataset(job.dataset, Path(work), holdout=job.holdout, downscale=job.downscale)
+        dataset = dataset_of(job, Path(work))
         moving = MovingPixels(dataset)
         number_of = {int(offset): number for number, offset in enumerate(dataset.pictures.offset)}
         views = [

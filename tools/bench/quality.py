@@ -11,6 +11,7 @@ Four measures, each of all pixels, of those that move and of the others (`kpc.en
 
 import csv
 import io
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -19,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from kpc.encoder.cli.metadata import hash_dataset
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import Comparison, has_windows, spread_evenly, ssim, testable_pictures
 from kpc.encoder.evaluation.moving import MovingPixels
@@ -99,13 +101,24 @@ def measure(job: Job) -> dict[str, Any]:
     """
     groups = Groups(job.scene)
     with tempfile.TemporaryDirectory(prefix="kpbench-") as work:
-        dataset = load_dataset(job.dataset, Path(work), holdout=job.holdout, downscale=job.downscale)
+        dataset = dataset_of(job, Path(work))
         shown = held_out_frames(groups, dataset, job.most)
         found = sorted(measured_frames(shown, dataset), key=lambda frame: (frame.camera, frame.frame))
     if not found:
         raise DatasetError(f"{job.dataset}: holds out no picture to compare with; give --holdout NAME")
     frames = [asdict(frame) for frame in found]
     return {"frames": frames, "means": means(frames)}
+
+
+def dataset_of(job: Job, work: Path) -> Dataset:
+    """Load the dataset of a job into a folder; say so on stderr if the scene was made from another one."""
+    dataset = load_dataset(job.dataset, work, holdout=job.holdout, downscale=job.downscale)
+    made = Groups(job.scene).metadata().provenance
+    is_as_encoded = job.downscale == int(made.get("options", {}).get("downscale", 1))
+    if "dataset_sha256" in made and is_as_encoded and made["dataset_sha256"] != hash_dataset(dataset):
+        name = job.dataset.resolve().name
+        print(f"kpbench: warning: {job.scene.name} was made from other files than those of {name}", file=sys.stderr)
+    return dataset
 
 
 def held_out_frames(groups: Groups, dataset: Dataset, most: int | None) -> Iterator[Shown]:
