@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from kpc.encoder.cli.encode_scene import encode_scene
-from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group, split_into_spans
+from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group, spans_of
 from kpc.encoder.cli.metadata import clip_metadata, hash_dataset
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import Setting, prepare_setting, trim_with_progress
@@ -27,7 +27,7 @@ from kpc.encoder.rdo.codec_model import load_checkpoint
 from kpc.encoder.training.importance import has_static_cameras
 from kpc.encoder.training.refinement import with_corrections
 from kpc.format.common import cli
-from kpc.format.common.errors import TrainingError, UsageError
+from kpc.format.common.errors import TrainingError
 from kpc.format.common.text import option_name
 from kpc.format.container import groups, scene_io
 from kpc.format.container.metadata_options import TEXTS
@@ -87,13 +87,9 @@ def plan_groups(options: Options, clip: Clip) -> tuple[groups.Span, ...]:
     Raises:
         UsageError: groups are too short, or there is none of the number `options.only`.
     """
-    group_s = float(options.group_s or 0)
-    spans = split_into_spans(clip, group_s)
-    if options.only is not None and options.only >= len(spans):
-        count = f"{len(spans)} group{'s' * (len(spans) != 1)}"
-        raise UsageError(f"--only {options.only}: the clip has {count}, numbered from 0")
+    spans = spans_of(options, clip)
     if len(spans) == 1:
-        log(f"--group {group_s:g}s: the clip lasts {clip.total_s:.3g} s, so it is a single group")
+        log(f"--group {options.group_s:g}s: the clip lasts {clip.total_s:.3g} s, so it is a single group")
     return spans
 
 

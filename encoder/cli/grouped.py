@@ -15,6 +15,7 @@ from kpc.encoder.cli.options import Options
 from kpc.encoder.field.field import Field
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import counted
 from kpc.format.container.container import ENTRY, HEADER
 from kpc.format.container.groups import Span
 from kpc.format.scene.scene import TIME_PLANES, Clip, Scene
@@ -46,6 +47,20 @@ def split_into_spans(clip: Clip, group_s: float) -> tuple[Span, ...]:
         first, last = max(shown_from - OVERLAP, 0), min(shown_to - 1 + OVERLAP, clip.frame_count - 1)
         spans.append(Span(first, last - first + 1))
     return tuple(spans)
+
+
+def spans_of(options: Options, clip: Clip) -> tuple[Span, ...]:
+    """Return the frames of each group of a clip; of all of it, where it is not encoded in groups.
+
+    Raises:
+        UsageError: groups are too short, or there is none of the number `options.only`.
+    """
+    if options.group_s is None:
+        return (Span(0, clip.frame_count),)
+    spans = split_into_spans(clip, options.group_s)
+    if options.only is not None and options.only >= len(spans):
+        raise UsageError(f"--only {options.only}: the clip has {counted(len(spans), 'group')}, numbered from 0")
+    return spans
 
 
 def options_of_group(options: Options, number: int, spans: Sequence[Span]) -> Options:

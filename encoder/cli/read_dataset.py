@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from kpc.encoder.cli.grouped import spans_of
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.work_folder import POSES
 from kpc.encoder.datasets import Dataset, load_dataset
@@ -28,7 +29,7 @@ def read_dataset(options: Options) -> Dataset:
 
     Raises:
         DatasetError, MediaError: the dataset cannot be used, or its cameras cannot be found.
-        UsageError: options about cameras are given, and so are the cameras.
+        UsageError: options about cameras are given, and so are the cameras; or the clip has no such groups.
     """
     _refuse_unused(options)
     root, transforms = options.source, None
@@ -48,6 +49,7 @@ def read_dataset(options: Options) -> Dataset:
         downscale=options.downscale or 1,
         most_across=options.most_across,
         transforms=transforms,
+        check_clip=lambda clip: spans_of(options, clip),
     )
 
 

@@ -4,7 +4,7 @@ import hashlib
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -62,6 +62,7 @@ def load_dataset(
     most_across: int | None = None,
     progress: bool = True,
     transforms: Path | None = None,
+    check_clip: Callable[[Clip], object] = lambda _: None,
 ) -> Dataset:
     """Read a dataset: recognise its layout by its content, decode its pictures and masks, and read its cameras.
 
@@ -77,6 +78,7 @@ def load_dataset(
         most_across: instead of `downscale`, the most pixels along the longer side of a picture.
         progress: whether to report progress on stderr.
         transforms: a document of `kpposes` for the folder, if it lies elsewhere.
+        check_clip: called before pictures are decoded; what it raises ends the reading.
 
     Raises:
         DatasetError: the folder does not exist, has no known layout, is inconsistent, its masks leave nothing to train
@@ -92,7 +94,7 @@ def load_dataset(
         report_orientations(root, capture.views)
         masks = find_masks(root, capture.views)
         left_out = count_left_out(root, capture, [mask.path for mask in masks if mask])
-        dataset = _load(root, capture, masks, Path(cache_dir), downscale, progress)
+        dataset = _load(root, capture, masks, Path(cache_dir), downscale, progress, check_clip)
         return replace(dataset, left_out=left_out)
     except PermissionError as error:
         file = Path(error.filename or root)
@@ -177,10 +179,17 @@ def _fitting_downscale(root: Path, views: Sequence[CapturedView], most_across: i
 
 
 def _load(
-    root: Path, capture: Capture, mask_files: list[MaskFile | None], cache_dir: Path, downscale: int, progress: bool
+    root: Path,
+    capture: Capture,
+    mask_files: list[MaskFile | None],
+    cache_dir: Path,
+    downscale: int,
+    progress: bool,
+    check_clip: Callable[[Clip], object],
 ) -> Dataset:
     views = capture.views
     frames, times, clip, video_start_s = _times(root, capture)
+    check_clip(clip)
     view_of = np.repeat(np.arange(len(views)), [len(some) for some in frames])  # the view of each picture
     used = [(some.start, some.stop) for some in frames]
     key = hashlib.sha256(os.fsencode(f"{root.resolve()} {downscale} {used}")).hexdigest()[:12]

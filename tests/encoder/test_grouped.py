@@ -25,7 +25,7 @@ from kpc.encoder.cli.grouped import (
 )
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer
-from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.datasets import Dataset, load_dataset, loading
 from kpc.encoder.field.config import PRESETS
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.layout import Layout
@@ -292,6 +292,16 @@ def test_a_dry_run_counts_all_groups(videos, tmp_path, monkeypatch):
     assert kpenc.dry_run(replace(options, only=1)) == Estimate(10.0, 2.0, 4.0, 9 + 2 * OVERLAP, 6, 8)
     with pytest.raises(UsageError, match="--only 3: the clip has 3 groups"):
         kpenc.dry_run(replace(options, only=3))
+
+
+@pytest.mark.parametrize(
+    "group_s, only, said", [(0.1, None, "--group 0.1s: 0 frames"), (1.2, 3, "--only 3: the clip has 3 groups")]
+)
+def test_groups_are_refused_before_pictures_are_decoded(videos, tmp_path, monkeypatch, group_s, only, said):
+    monkeypatch.setattr(loading, "cached_pixels", lambda *_: pytest.fail("decoded"))
+    with pytest.raises(UsageError, match=said):
+        kpenc.encode(Options(videos, tmp_path / "long.kpc", group_s=group_s, only=only))
+    assert not (tmp_path / "long.kpc.work").exists()
 
 
 def test_a_group_that_is_longer_than_the_clip_is_logged(capsys):
