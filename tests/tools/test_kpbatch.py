@@ -12,6 +12,7 @@ import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -435,6 +436,20 @@ def test_a_scheduler_that_is_killed_is_one_line_and_another_goes_on(
         assert sorted(event.task.key for event in made.events() if event.kind == "done") == ["key0", "key1", "key2"]
     assert len(Store(str(tmp_path)).names("*/step*")) == 30
     assert 30 <= len(list(tmp_path.glob("key?.*"))) <= 31  # the step in which the worker ended may be done twice
+
+
+@pytest.mark.parametrize("status", ["finished", "error"])
+def test_a_connection_that_breaks_before_an_outcome_has_come_is_one_line(tmp_path: Path, status: str) -> None:
+    class Lost:
+        def result(self) -> None:
+            raise CancelledError
+
+        exception = result
+
+    lost: Any = Lost()
+    lost.status = status
+    with pytest.raises(engine.ClusterError, match="run the same command to go on"):
+        Engine(lambda: lost, Place(str(tmp_path)))._outcome_of(lost, task(0))
 
 
 def test_a_child_ends_with_its_worker(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -244,11 +245,12 @@ class Engine:
         Raises:
             ClusterError: the scheduler, or its client, has given it up.
         """
-        if future.status == "finished":
-            found: Outcome = future.result()
-            return found
-        if future.status == "error":
-            return Outcome(task.key, False, {}, " ".join(str(future.exception()).split()))
+        with contextlib.suppress(CancelledError):  # the connection may break after the status is known
+            if future.status == "finished":
+                found: Outcome = future.result()
+                return found
+            if future.status == "error":
+                return Outcome(task.key, False, {}, " ".join(str(future.exception()).split()))
         raise ClusterError("the scheduler has lost its tasks; run the same command to go on")
 
     def _ended(self, outcome: Outcome) -> Outcome:
