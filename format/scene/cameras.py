@@ -153,7 +153,7 @@ def _parse_view(where: str, frame: Mapping[str, Any], number: int) -> View:
     if not 0.0 <= time <= 1.0:
         raise DatasetError(f"{where}: time {time:g} lies outside [0, 1]; correct the file")
     at_s = None if frame.get("at") is None else number_of(where, frame, "at")
-    return View(camera, time, str(frame.get("file", f"{number:04d}.png")), at_s)
+    return View(camera, time, str(frame.get("file") or f"{number:04d}.png"), at_s)
 
 
 def save_views(path: str | os.PathLike[str], views: Sequence[View]) -> None:

@@ -16,6 +16,7 @@ import os
 import re
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,11 +55,11 @@ def _command(argv: list[str]) -> None:
         _play_in_browser(options)
         return
     options.memory = DEFAULT_BUDGET if options.memory is None else options.memory
-    if options.frames is not None and options.frames < 1:
-        raise UsageError(f"--frames {options.frames} is not positive")
     if options.screenshot is not None:
         cli.check_writable(options.screenshot, option="--screenshot")
-    cli.make_folder(Path(options.folder or "."))
+    if options.folder is not None:
+        cli.check_writable(Path(options.folder), is_folder=True, option="--folder")
+        cli.make_folder(Path(options.folder))
     path = None if options.path is None else CameraPath.load(options.path)
 
     # Imported here so that errors in the options are reported without OpenGL's libraries.
@@ -135,7 +136,10 @@ def _parser() -> argparse.ArgumentParser:
         help="for screenshots, videos and camera paths; it is made (default: the working directory)",
     )
     parser.add_argument(
-        "--frames", type=cli.whole_number, metavar="N", help="exit after N frames; settings are neither read nor saved"
+        "--frames",
+        type=partial(cli.whole_number, low=1),
+        metavar="N",
+        help="exit after N frames; settings are neither read nor saved",
     )
     parser.add_argument("--web", action="store_true", help="play in the browser of this machine, without a window")
     parser.add_argument("--screenshot", type=cli.output_file(".png"), metavar="PNG", help="save the window at the end")

@@ -233,3 +233,10 @@ def test_camera_files_are_refused_in_one_line(tmp_path: Path, change: dict[str, 
     file.write_text(json.dumps({"frames": [FRAME, FRAME | change]}))
     with pytest.raises(DatasetError, match=rf"c\.json frame 1: [^\n]*{words}[^\n]*\Z"):
         load_views(file)
+
+
+@pytest.mark.parametrize("name", [{}, {"file": None}, {"file": ""}])
+def test_views_without_a_name_are_numbered(tmp_path: Path, name: dict[str, Any]) -> None:
+    nameless = {key: value for key, value in FRAME.items() if key != "file"}
+    (tmp_path / "c.json").write_text(json.dumps({"frames": [FRAME, nameless | name]}))
+    assert load_views(tmp_path / "c.json")[1].file == "0001.png"

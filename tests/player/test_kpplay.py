@@ -229,7 +229,7 @@ def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
         (["{scene}", "--screenshot", "x.jpg"], 2, "x.jpg"),
         (["{scene}", "--screenshot", "x.png/"], 2, "x.png/"),
         (["{scene}", "--folder", "{scene}"], 2, "is a file, not a folder"),
-        (["{scene}", "--folder", "{scene}/below"], 1, "tiny.kpc"),
+        (["{scene}", "--folder", "{scene}/below"], 2, "is a file, not a folder"),
         (["{scene}", "--path", "nowhere.json"], 1, "nowhere.json"),
         (["{scene}", "--path", "{scene}"], 1, "tiny.kpc"),
         (["{scene}", "--quality", "perfect"], 2, "fastest"),
