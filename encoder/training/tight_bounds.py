@@ -1,4 +1,4 @@
-"""A short first training pass that finds the part of the box that the scene fills, so that no texel is wasted."""
+"""Short first training passes that find the part of the box that the scene fills, so that no texel is wasted."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +11,11 @@ from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.scene.space import DeviceCoordinates
 
-# Steps of the pass. What fewer than MIN_STEPS find is not reliable.
+# Passes at most where near and far were found with the cameras, else there is one; another follows where the last made
+# the longest edge shorter by SHRINKAGE or more, as a share.
+PASSES, SHRINKAGE = 3, 0.05
+
+# Steps of a pass. What fewer than MIN_STEPS find is not reliable.
 MAX_STEPS = 300
 MIN_STEPS = 100
 
@@ -36,9 +40,14 @@ def trim_box(
 ) -> tuple[np.ndarray, float]:
     """Find the part of a box (2, 3) that holds what the pictures show.
 
-    A coarse field is trained on the CPU for a tenth of `config.steps`, or of the time budget where given, but for at
-    most MAX_STEPS. The result spans the OUTLIERS to 1 - OUTLIERS quantiles of the points where rays hit a surface, and
-    MARGIN more, within `aabb`. It is `aabb` after fewer than MIN_STEPS, or where less than 1 % of the rays hit one.
+    A coarse field is trained on the CPU for a tenth of `config.steps`, but for at most MAX_STEPS. The result spans the
+    OUTLIERS to 1 - OUTLIERS quantiles of the points where rays hit a surface, and MARGIN more, within `aabb`. A pass
+    changes nothing after fewer than MIN_STEPS, or where less than 1 % of the rays hit a surface.
+
+    Near and far of found cameras have wide margins, and in a box much larger than the scene the coarse field is fog in
+    places. With such cameras there are up to PASSES passes, each in the box that the last one found, until one leaves
+    the longest edge e at (1 - SHRINKAGE) e or more (docs/design/training.md). All passes take a tenth of the time
+    budget at most, where one is given.
 
     Returns:
         The box, and the seconds that this took.
@@ -49,6 +58,36 @@ def trim_box(
     steps = max(1, min(MAX_STEPS, config.steps // 10))
     if time_budget_s is None and steps < MIN_STEPS:
         return aabb, 0.0
+    elapsed_s, left_s = 0.0, time_budget_s and time_budget_s / 10
+    passes = PASSES if dataset.poses_found else 1
+    for done in range(passes):
+
+        def report_pass(part: Report, done: int = done) -> None:
+            report(replace(part, fraction=(done + part.fraction) / passes))
+
+        before = aabb
+        aabb, took_s = _trim_once(dataset, replace(config, steps=steps), before, report_pass, left_s, mapping)
+        elapsed_s += took_s
+        if _longest_edge(aabb) > (1 - SHRINKAGE) * _longest_edge(before):
+            break
+        if left_s is not None and (left_s := left_s - took_s) < took_s:  # not enough for another
+            break
+    return aabb, elapsed_s
+
+
+def _longest_edge(aabb: np.ndarray) -> float:
+    return float((aabb[1] - aabb[0]).max())
+
+
+def _trim_once(
+    dataset: Dataset,
+    config: TrainConfig,
+    aabb: np.ndarray,
+    report: Callable[[Report], None],
+    time_budget_s: float | None,
+    mapping: DeviceCoordinates | None,
+) -> tuple[np.ndarray, float]:
+    """Do one pass of `trim_box` of `config.steps`, or of a time budget; return the box and the seconds it took."""
     coarse = replace(
         config,
         hybrid=False,
@@ -60,12 +99,11 @@ def trim_box(
         temporal_start=1.0,
         samples_across=160,
         cells_across=64,
-        steps=steps,
         occupancy_start=64,
         refine="none",
     )
     trainer = Trainer(dataset, coarse, aabb, "cpu", mapping=mapping)
-    trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10, most_steps=MAX_STEPS)
+    trainer.run(report, time_budget_s=time_budget_s, most_steps=MAX_STEPS)
     if trainer.step < MIN_STEPS:
         return aabb, trainer.elapsed_s
     rays, _ = trainer.sampler.draw(np.random.default_rng(config.seed), RAYS, trainer.background)

@@ -9,7 +9,9 @@ import pytest
 from kpc.encoder.cli.options import Options
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import PRESETS, TrainConfig
-from kpc.encoder.training.tight_bounds import MAX_STEPS, trim_box
+from kpc.encoder.training import tight_bounds
+from kpc.encoder.training.tight_bounds import MAX_STEPS, PASSES, trim_box
+from kpc.encoder.training.train import Report
 
 CONFIG = TrainConfig(steps=1500, rays=256, samples=12288, warmup=5)
 LARGE = np.array([[-3, -3, -3], [3, 3, 3]], np.float32)
@@ -36,6 +38,41 @@ def test_trimming_takes_a_bounded_part_of_the_time(moving: Dataset) -> None:
     box, seconds = trim_box(moving, long, LARGE, lambda report: steps.append(report.step), time_budget_s=1e5)
     assert steps[-1] <= MAX_STEPS and seconds < 1e4
     assert np.array_equal(box, trim_box(moving, long, LARGE, lambda report: None)[0])
+
+
+@pytest.fixture
+def passes(monkeypatch: pytest.MonkeyPatch) -> list[float | None]:
+    """The time budgets of passes that each take 2 s and halve a box, down to an edge of 3."""
+    budgets: list[float | None] = []
+
+    def halve(dataset, config, aabb, report, time_budget_s, mapping):
+        budgets.append(time_budget_s)
+        report(Report(config.steps, 1.0, 20.0, 1.0, 1.0, 1.0, 2.0))
+        return (aabb / max(1.0, min(2.0, (aabb[1] - aabb[0]).max() / 3))).astype(np.float32), 2.0
+
+    monkeypatch.setattr(tight_bounds, "_trim_once", halve)
+    return budgets
+
+
+@pytest.mark.parametrize("edges, count, left", [(3, 1, 3), (3.1, 1, 3), (6, 2, 3), (12, 3, 3), (100, PASSES, 12.5)])
+def test_passes_go_on_while_the_box_shrinks_much(moving, passes, edges, count, left) -> None:
+    fractions: list[float] = []
+    found = replace(moving, poses_found=True)
+    box, seconds = trim_box(found, CONFIG, LARGE * (edges / 6), lambda report: fractions.append(report.fraction))
+    assert (box[1] - box[0]).max() == pytest.approx(left)
+    assert seconds == 2 * count and passes == [None] * count
+    assert fractions == pytest.approx([(done + 1) / PASSES for done in range(count)])
+
+
+@pytest.mark.parametrize("budget_s, budgets", [(15, [1.5]), (39, [3.9]), (40, [4.0, 2.0]), (100, [10.0, 8.0, 6.0])])
+def test_passes_stay_within_the_time(moving, passes, budget_s, budgets) -> None:
+    trim_box(replace(moving, poses_found=True), CONFIG, LARGE * 20, lambda report: None, time_budget_s=budget_s)
+    assert passes == pytest.approx(budgets)
+
+
+def test_there_is_one_pass_where_poses_were_given(moving, passes) -> None:
+    assert trim_box(moving, CONFIG, LARGE * 20, lambda report: None)[1] == 2
+    assert passes == [None]
 
 
 def test_a_single_object_in_monocular_video_gets_an_adapted_config(moving: Dataset, tmp_path: Path) -> None:
