@@ -159,6 +159,21 @@ def linear_per_cell(scene: Scene) -> Scene:
     return scene
 
 
+def with_moving_area(scene: Scene) -> Scene:
+    """Return the scene with coarser scales that stand still and a finest one that is 0 outside a part of the box, as
+    `kpenc --layers auto` makes them."""
+    *coarser, finest = map(dict, scene.scales)
+    for scale in coarser:
+        scale.update({name: np.ones_like(scale[name][:2]) for name in TIME_PLANES if name in scale})
+    finest.update({name: 3 * finest[name] - 2 for name in TIME_PLANES if name in finest})  # it alone moves
+    for name in SPACE_PLANES:
+        rows, columns, _ = finest[name].shape
+        inside = np.zeros((rows, columns, 1), np.float32)
+        inside[rows // 4 : rows - rows // 5, columns // 5 : columns - columns // 4] = 1
+        finest[name] = finest[name] * inside
+    return replace(scene, scales=(*coarser, finest))
+
+
 # The box with an explicit decoder, and every alternative to it.
 VARIANTS: dict[str, Callable[[Scene], Scene]] = {
     "box": lambda scene: scene,
@@ -166,6 +181,7 @@ VARIANTS: dict[str, Callable[[Scene], Scene]] = {
     "displaced": with_motion,
     "ndc": in_device_coordinates,
     "hybrid": with_hybrid_decoder,
+    "moving area": with_moving_area,
 }
 
 

@@ -246,7 +246,7 @@ class Field(nn.Module):
             appearance_names: of the codes, as many.
         """
         names = ALL_PLANES if self.layout.is_dynamic else SPACE_PLANES
-        scales = tuple({name: self._whole_plane(s, name) for name in names} for s in range(len(self.layout.resolution)))
+        scales = tuple({name: self.whole_plane(s, name) for name in names} for s in range(len(self.layout.resolution)))
         decoder, codes = self.export_decoder(), np.zeros((0, len(self.b1)), np.float32)
         if self.codes is not None:
             mean = _array(self.codes).mean(0, dtype=np.float64).astype(np.float32)
@@ -264,32 +264,42 @@ class Field(nn.Module):
             appearances=tuple(Appearance(name, code) for name, code in zip(appearance_names, codes, strict=True)),
         )
 
-    def _whole_plane(self, scale: int, name: str) -> np.ndarray:
-        """Return one plane of the whole box, (rows, columns, M): 0 or 1 where it is not held."""
+    def whole_plane(self, scale: int, name: str) -> np.ndarray:
+        """Return a copy of one plane of the whole box, (rows, columns, M): 0 or 1 where it is not held."""
         layout, axes = self.layout, [AXES.index(axis) for axis in name]
         columns, rows = (max(int(layout.resolution[scale, axis]), FEWEST_ROWS) for axis in axes)
         whole = np.full((rows, columns, layout.channels), float(name in TIME_PLANES), np.float32)
-        if layout.table[scale, ALL_PLANES.index(name)] >= 0:
-            held = _array(self.plane(scale, name))
-            x, y = (int(layout.first[scale, axis]) if axis < 3 else 0 for axis in axes)
-            whole[y : y + held.shape[0], x : x + held.shape[1]] = held
+        if layout.has(scale, name):
+            whole[self._held(scale, name)] = _array(self.plane(scale, name))
         return whole
 
+    def _held(self, scale: int, name: str) -> tuple[slice, slice]:
+        """Return which rows and columns of a plane of the whole box are held."""
+        axes = [AXES.index(axis) for axis in reversed(name)]
+        first = [int(self.layout.first[scale, axis]) if axis < 3 else 0 for axis in axes]
+        rows, columns = (
+            slice(at, at + int(self.layout.held[scale, axis])) for at, axis in zip(first, axes, strict=True)
+        )
+        return rows, columns
+
     @staticmethod
-    def from_scene(scene: Scene) -> "Field":
+    def from_scene(scene: Scene, layout: Layout | None = None) -> "Field":
         """Return a field with a scene's planes, decoder, motion grid and codes.
+
+        Args:
+            layout: of the field; None for all texels of the scene. What it leaves out is taken for 0, and 1 in time.
 
         Raises:
             ValueError: a plane has a single texel along an axis (see `rdo.codec_model.widen_single_texels`).
         """
         if any(min(plane.shape[:2]) < 2 for scale in scene.scales for plane in scale.values()):
             raise ValueError("a plane has a single texel along an axis")
-        shape = {name: scene.scales[0][name].shape for name in scene.scales[0]}
-        resolution = []
-        for scale in scene.scales:
-            rows_t = scale["xt"].shape[0] if scene.is_dynamic else 0
-            resolution.append([scale["xy"].shape[1], scale["xy"].shape[0], scale["xz"].shape[0], rows_t])
-        layout = Layout.of(np.array(resolution), shape["xy"][2])
+        if layout is None:
+            resolution = []
+            for scale in scene.scales:
+                rows_t = scale["xt"].shape[0] if scene.is_dynamic else 0
+                resolution.append([scale["xy"].shape[1], scale["xy"].shape[0], scale["xz"].shape[0], rows_t])
+            layout = Layout.of(np.array(resolution), scene.scales[0]["xy"].shape[2])
         kind = HybridField if isinstance(scene.decoder, HybridDecoder) else Field
         field = kind(
             layout,
@@ -298,9 +308,8 @@ class Field(nn.Module):
             appearances=len(scene.appearances),
         )
         with torch.no_grad():
-            for s, scale in enumerate(scene.scales):
-                for name, plane in scale.items():
-                    _fill(field.plane(s, name), plane)
+            for s, name, *_ in layout.planes():
+                _fill(field.plane(s, name), scene.scales[s][name][field._held(s, name)])
             if field.motion is not None and scene.motion is not None:
                 _fill(field.motion, scene.motion)
             if field.codes is not None:

@@ -2,13 +2,14 @@
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.occupancy_grid import grid_shape
+from kpc.format.scene.areas import area_texels
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip
 
 AXES = "xyzt"
@@ -71,6 +72,10 @@ class Layout:
         """Whether all scales cover the box, and have the same planes."""
         return bool((self.held == self.resolution).all() and len(set((self.resolution[:, 3] > 0).tolist())) == 1)
 
+    def has(self, scale: int, name: str) -> bool:
+        """Return whether a scale has a plane."""
+        return bool(self.table[scale, ALL_PLANES.index(name)] >= 0)
+
     @functools.cached_property
     def areas(self) -> np.ndarray:
         """(S, 2, 4) float32: of each scale along x, y and z where its area begins in [0, 1], and how often it would fit
@@ -106,6 +111,28 @@ def plan_layout(config: TrainConfig, aabb: np.ndarray, clip: Clip, is_dynamic: b
     rows = time_rows(clip.frame_count, config.frames_per_row) if is_dynamic else 0
     resolution = [[max(2, round(n * e / edges.max())) for e in edges] + [rows] for n in config.resolutions]
     return Layout.of(np.array(resolution), config.channels)
+
+
+def layout_of_planes(scales: Sequence[Mapping[str, np.ndarray]]) -> Layout:
+    """Return a layout for planes of a scene that leaves out what its features do not depend on.
+
+    Those are the texels beyond the area in which the features of a scale are other than 0 (`area_texels`), but for one
+    on either side; and the space-time planes of scales where they are the identity, while those of others are not.
+
+    Args:
+        scales: the planes of each, (rows, columns, M), as many channels in all.
+    """
+    moves = [any((scale[name] != 1).any() for name in TIME_PLANES if name in scale) for scale in scales]
+    resolution, spans = [], []
+    for scale, is_moving in zip(scales, moves, strict=True):
+        size = np.array([scale["xy"].shape[1], *scale["yz"].shape[1::-1]])
+        has_rows = "xt" in scale and (is_moving or not any(moves))
+        resolution.append([*size, len(scale["xt"]) if has_rows else 0])
+        texels = area_texels({name: np.any(scale[name], axis=2) for name in SPACE_PLANES})
+        first, last = np.stack([0 * size, size - 1]) if texels is None else texels.T
+        first, last = np.maximum(first - 1, 0), np.minimum(last + 1, size - 1)
+        spans.append(np.stack([first, last - first + 1], axis=1))
+    return Layout.of(np.array(resolution), scales[0]["xy"].shape[2], np.array(spans))
 
 
 def _plan_moving_area(config: TrainConfig, area: np.ndarray, edges: np.ndarray, clip: Clip) -> Layout:

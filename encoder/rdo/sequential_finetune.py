@@ -19,6 +19,7 @@ from kpc.encoder.evaluation.evaluate import SceneRenderer, pad_channels, unpad_d
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
+from kpc.encoder.field.layout import layout_of_planes
 from kpc.encoder.rdo.distortion import PlaneKey
 from kpc.encoder.training.fused_optimiser import FusedOptimiser
 from kpc.encoder.training.torch_optimiser import TorchOptimiser
@@ -151,10 +152,13 @@ def _finetune(
         )
         for part, values in zip(fixed, before, strict=True):
             theta[part] = values
+        field.clear_border()
         progress.advance()
     scales = tuple(
         {
-            name: plane if (s, name) in settled else field.plane(s, name).detach().numpy()[..., : plane.shape[2]].copy()
+            name: field.whole_plane(s, name)[..., : plane.shape[2]]
+            if (s, name) not in settled and field.layout.has(s, name)
+            else plane
             for name, plane in scale.items()
         }
         for s, scale in enumerate(scene.scales)
@@ -164,7 +168,8 @@ def _finetune(
 
 def _field_and_optimiser(scene: Scene, steps: int) -> tuple[Field, FusedOptimiser | TorchOptimiser]:
     """Return the scene as a field, and an optimiser without any regularisation within `steps`."""
-    field = Field.from_scene(pad_channels(scene))
+    padded = pad_channels(scene)
+    field = Field.from_scene(padded, layout_of_planes(padded.scales))
     explicit = isinstance(scene.decoder, Decoder)
     config = replace(
         TrainConfig(),

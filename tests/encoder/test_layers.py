@@ -14,7 +14,7 @@ from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import fused_features
-from kpc.encoder.field.layout import Layout, plan_layout
+from kpc.encoder.field.layout import Layout, layout_of_planes, plan_layout
 from kpc.encoder.training.moving_area import find_moving_area
 from kpc.encoder.training.train import Trainer
 from kpc.format.coding.quantise import quantise_plane, quantise_scene
@@ -86,6 +86,25 @@ def test_kernels_and_pytorch_agree_with_the_whole_planes(field: Field) -> None:
         assert field.theta.grad is not None
         gradients.append(field.theta.grad.clone())
     torch.testing.assert_close(*gradients, rtol=0, atol=1e-5 * float(gradients[0].abs().max()))
+
+
+def test_a_layout_of_planes_leaves_out_what_does_not_count(field: Field) -> None:
+    scene = as_scene(field)
+    layout = layout_of_planes(scene.scales)
+    assert (layout.resolution[:, 3] == field.layout.resolution[:, 3]).all() and layout.size <= field.layout.size
+    tight, generator = Field.from_scene(scene, layout), torch.Generator().manual_seed(3)
+    points, times = torch.rand(5000, 3, generator=generator), torch.rand(5000, generator=generator)
+    torch.testing.assert_close(tight.features(points, times), field.features(points, times), rtol=0, atol=2e-6)
+    for scale, planes in enumerate(as_scene(tight).scales):
+        for name, plane in planes.items():
+            np.testing.assert_array_equal(plane, scene.scales[scale][name])
+
+
+def test_a_layout_of_planes_without_parts_holds_all_texels() -> None:
+    for dynamic in (True, False):
+        scene = tiny_scene(dynamic=dynamic)
+        layout = layout_of_planes(scene.scales)
+        assert layout.is_uniform and layout.size == Field.from_scene(scene).layout.size
 
 
 def test_gradients_of_points_are_those_of_the_whole_planes(field: Field) -> None:

@@ -24,8 +24,8 @@ from kpc.encoder.rdo.sequential_finetune import (
 )
 from kpc.format.coding.quantise import QuantisedScene, quantise_scene
 from kpc.format.container import scene_io
-from kpc.format.scene.scene import Decoder, Scene
-from scenes import tiny_scene, with_appearances, with_hybrid_decoder, with_motion
+from kpc.format.scene.scene import TIME_PLANES, Decoder, Scene
+from scenes import tiny_scene, with_appearances, with_hybrid_decoder, with_motion, with_moving_area
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STEP = 0.2
@@ -131,6 +131,19 @@ def test_results_are_reproducible() -> None:
     assert scene_writer.encode(quantise_sequentially(scene, scene, choose, 5)) == scene_writer.encode(
         quantise_sequentially(scene, scene, choose, 5)
     )
+
+
+def test_what_is_made_for_an_area_stays_in_it() -> None:
+    """And what stands still gets no time rows."""
+    scene = with_moving_area(tiny_scene())
+    tuned = code_sequentially(scene, scene, lambda candidate, group: {}, 4)
+    for before, after in zip(scene.scales, tuned.scales, strict=True):
+        for name, plane in before.items():
+            assert after[name].shape == plane.shape
+            if name in TIME_PLANES:
+                assert (plane != 1).any() or (after[name] == 1).all()
+            else:
+                assert not after[name][plane == 0].any() and (after[name] != plane).any()
 
 
 def test_view_independent_colour_stays_so() -> None:
