@@ -1,10 +1,10 @@
 """Which parts of a scene are static: cells in which the time planes hold the multiplicative identity.
 
 A point reads one column of each time plane (`kpc.format.scene.scene`). A cell of the occupancy grid is static during
-its time slot if every texel of "xt", "yt" and "zt", at every scale, that is read from within the cell during that slot
-is exactly 1. With a motion grid, all displacements that act on the cell must be 0 over the whole clip, too. (A
-displacement that is constant but not 0 changes nothing either; it still counts as motion, since training never
-produces one.)
+its time slot if every texel of "xt", "yt" and "zt" that is read from within the cell during that slot is exactly 1, at
+every scale whose features are not 0 there, that is, whose space planes all hold a texel other than 0 that is read.
+With a motion grid, all displacements that act on the cell must be 0 over the whole clip, too. (A displacement that is
+constant but not 0 changes nothing either; it still counts as motion, since training never produces one.)
 """
 
 import math
@@ -48,6 +48,8 @@ def _fraction(cells: np.ndarray, occupied: np.ndarray) -> float:
 def _cells_without(scene: Scene, differs: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Return (slots, Nz, Ny, Nx) bool: cells that read no texel of a time plane for which `differs` is true.
 
+    Scales whose features are 0 in a cell are not asked.
+
     `differs` maps a plane (rows, columns, M) to (rows, columns) bool.
     """
     slots, nz, ny, nx = scene.occupancy.shape
@@ -56,10 +58,15 @@ def _cells_without(scene: Scene, differs: Callable[[np.ndarray], np.ndarray]) ->
         return out
     shapes = {"xt": (slots, 1, 1, nx), "yt": (slots, 1, ny, 1), "zt": (slots, nz, 1, 1)}
     for scale in scene.scales:
+        moves = np.zeros_like(out)
         for name in TIME_PLANES:
             cells = math.prod(shapes[name]) // slots
             reading = cells_reading(cells_reading(differs(scale[name]), 0, slots), 1, cells)
-            out &= ~reading.reshape(shapes[name])
+            moves |= reading.reshape(shapes[name])
+        for name, (rows, columns) in {"xy": (ny, nx), "xz": (nz, nx), "yz": (nz, ny)}.items():
+            used = cells_reading(cells_reading(np.any(scale[name], axis=2), 0, rows), 1, columns)
+            moves &= np.expand_dims(used, [axis in name for axis in "zyx"].index(False))
+        out &= ~moves
     if scene.motion is not None:
         displaced = (scene.motion != 0).any(axis=(0, 4))
         for axis, count in enumerate((nz, ny, nx)):

@@ -9,13 +9,13 @@ import pytest
 
 from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import needed_texels, quantise_scene
-from kpc.format.scene.scene import TIME_PLANES, Scene
+from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Scene
 from kpc.format.scene.static import cells_reading, constant_cells, constant_fraction, static_cells, static_fraction
 from kpc.player.cpu import motion_map, reference
 from kpc.player.cpu.motion_map import motionless_share
 from kpc.player.cpu.reference import SceneAtTime
 from kpc.tools.cli import kpinfo
-from scenes import VARIANTS, tiny_scene
+from scenes import VARIANTS, tiny_scene, with_moving_area
 
 
 def still(scene: Scene) -> Scene:
@@ -102,6 +102,18 @@ def test_features_in_static_cells_are_those_of_the_static_scene() -> None:
         for time in (slot + rng.uniform(size=4)) / slots:
             full, static = SceneAtTime.of(scene, time), SceneAtTime.of(scene, time, with_motion=False)
             assert np.array_equal(reference.features(scene, full, u), reference.features(scene, static, u))
+
+
+def test_cells_beyond_a_moving_area_are_static() -> None:
+    scene = with_moving_area(tiny_scene())
+    ones = ({name: np.ones_like(scale[name]) for name in SPACE_PLANES} for scale in scene.scales)
+    whole = replace(scene, scales=tuple({**scale, **planes} for scale, planes in zip(scene.scales, ones, strict=True)))
+    cells = static_cells(scene)
+    assert (cells >= static_cells(whole)).all() and cells.mean() > 1.2 * static_cells(whole).mean()
+    at, rng = np.argwhere(cells.all(axis=0)), np.random.default_rng(1)
+    u = ((at + rng.uniform(size=at.shape)) / cells.shape[1:])[:, ::-1].astype(np.float32)
+    one, other = (reference.features(scene, SceneAtTime.of(scene, time), u) for time in (0.3, 0.6))
+    assert np.array_equal(one, other) and one.any()
 
 
 def test_cells_reading_is_the_inverse_of_needed_texels() -> None:
