@@ -21,7 +21,7 @@ from kpc.player.app.scene_view import SceneView
 from kpc.player.app.state import PlayerState
 from kpc.player.app.widgets import message
 from kpc.player.app.window import Window
-from kpc.player.gl.renderer import is_software
+from kpc.player.gl.programs import is_software
 from kpc.player.quality import neighbouring_level
 from kpc.player.sound.clip_samples import ClipSamples
 from kpc.player.sound.playback import SoundPlayback

@@ -12,7 +12,8 @@ from kpc.format.scene.scene import Scene
 from kpc.player.app.controls import AppearanceSelection
 from kpc.player.app.state import PlayerState
 from kpc.player.cpu.reference import Part
-from kpc.player.gl.renderer import Renderer, is_software
+from kpc.player.gl.programs import is_software
+from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LEVELS, Quality
 
 # Statistics are measured this often, from a picture of this many pixels.

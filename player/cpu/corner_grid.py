@@ -8,8 +8,10 @@ needs them. Figures: docs/design/drawing.md.
 
 import numpy as np
 
+from kpc.format.scene.areas import AXES
 from kpc.format.scene.grid import sample_linear, texel_and_fraction
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Scene
+from kpc.player.areas import feature_area
 from kpc.player.atlas import Layout, pad_to_multiple
 from kpc.player.cpu.field_kernels import CornerGridArrays
 from kpc.player.cpu.field_sampler import FieldArrays, FieldSampler, quantised_planes
@@ -34,6 +36,9 @@ class CornerGrid(FieldSampler):
         self._known = np.zeros((WORKERS, *self.values.shape[:3]), np.uint8)
         self._channels = [scale["xy"].shape[2] for scale in scene.scales]
         self._planes: tuple[np.ndarray, ...] = ()
+        # Of each scale, where it counts (`feature_area`), and whether it moved at the last time.
+        self._areas = np.zeros((len(self._channels), 2, 3), np.float32)
+        self._moved = np.zeros(len(self._channels), bool)
         self._rows: tuple[np.ndarray, ...] = ()
         # Rows of time planes at corners, by plane, scale and number.
         self._corner_rows: dict[tuple[str, int, int], np.ndarray] = {}
@@ -53,8 +58,10 @@ class CornerGrid(FieldSampler):
 
     def set_planes(self, atlas: np.ndarray) -> None:
         planes: dict[str, list[np.ndarray]] = {name: [] for name in SPACE_PLANES}
+        used: list[dict[str, np.ndarray]] = [{} for _ in self._channels]
         for block in self._layout.blocks:
             plane = self._layout.plane(atlas, block)[..., : self._channels[block.scale]]
+            used[block.scale][block.plane] = np.any(plane, axis=2)
             across = self._at_corners(plane.swapaxes(0, 1), block.plane[0])
             planes[block.plane].append(self._at_corners(across.swapaxes(0, 1), block.plane[1]))
         weights, quantised = self._weights.astype(np.float64), []
@@ -65,16 +72,34 @@ class CornerGrid(FieldSampler):
             weights = weights * step
         self._planes = tuple(quantised)
         self._scaled_weights = np.clip(weights, -LARGEST, LARGEST).astype(np.float32)
+        self._areas = np.stack([feature_area(planes) for planes in used])
         self.time_planes_changed()
 
     def time_planes_changed(self) -> None:
         super().time_planes_changed()
         self._corner_rows = {}
+        self._known[:] = 0
 
     def _prepare_time(self, time: float | None) -> None:
         assert time is not None, "the static part is drawn by planes"
         self._rows = self._rows_at(time)
-        self._known[:] = 0
+        moves = self._moving_scales()
+        for area in self._areas[moves | self._moved]:
+            self._forget(area)
+        self._moved = moves
+
+    def _moving_scales(self) -> np.ndarray:
+        """Return whether the rows of each scale are other than 1, (S,) bool."""
+        differ = np.any([(rows != 1).any(axis=0) for rows in self._rows], axis=0)[: sum(self._channels)]
+        return np.array([part.any() for part in np.split(differ, np.cumsum(self._channels)[:-1])])
+
+    def _forget(self, area: np.ndarray) -> None:
+        """Forget the corners in an area (2, 3), and those that know that all corners up to it are computed."""
+        inside = []
+        for axis, corners in self._corners.items():
+            low, high = area[:, AXES.index(axis)]
+            inside.append(slice(max(np.searchsorted(corners, low, "right") - 1, 0), np.searchsorted(corners, high)))
+        self._known[:, *inside] = 0
 
     def _arrays(self, worker: int) -> FieldArrays:
         bias, grid = (

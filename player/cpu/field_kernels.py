@@ -69,7 +69,8 @@ class PlaneArrays(NamedTuple):
     planes: np.ndarray  # (N,) int16
     rows: np.ndarray  # (N,) float32
     firsts: np.ndarray  # (groups, 6) int64, where xy, xz, yz and the rows of x, y, z begin
-    sizes: np.ndarray  # (groups, 3) int64, texels along x, y, z, at least two
+    sizes: np.ndarray  # (groups, 4) int64, texels along x, y, z, at least two; 1 where rows are other than 1, else 0
+    areas: np.ndarray  # (groups, 2, 3) float32, `kpc.player.areas.feature_area`
     w1: np.ndarray  # (H, 9) float32; H is 0 for view-independent colour
     b1: np.ndarray  # (H,) float32, with the appearance code added
     w2: np.ndarray  # (H, 4 F) float32, 0 for the density, times the quantisation steps of the planes, as the next
@@ -129,7 +130,13 @@ def sample_planes(found, box, planes, lanes):
         samples[LOG_DENSITY, j] = planes.bias
     for group in range(U(len(planes.sizes))):
         _find_texels(found, group, planes, lanes)
-        _accumulate_group(found, group, planes, lanes)
+        if not _is_whole(planes.areas[group]):
+            count = _find_in_area(found, planes.areas[group], lanes)
+            _accumulate_group(count, lanes.missing, group, planes.rows, planes, lanes)
+        elif planes.sizes[group, 3]:
+            _accumulate_group(found, None, group, planes.rows, planes, lanes)
+        else:
+            _accumulate_group(found, None, group, None, planes, lanes)
 
 
 @kernel_part
@@ -203,6 +210,28 @@ def _weights_of_rays(found, box, planes, lanes):
 
 
 @kernel_part
+def _is_whole(area):
+    """Return whether an area holds all positions."""
+    low, high = max(area[0, 0], max(area[0, 1], area[0, 2])), min(area[1, 0], min(area[1, 1], area[1, 2]))
+    return (low < ZERO) & (high > ONE)
+
+
+@kernel_part
+def _find_in_area(found, area, lanes):
+    """List the samples in an area in `lanes.missing`, and return how many they are."""
+    samples, is_inside, chosen = lanes.samples, lanes.cell, lanes.missing
+    x_low, y_low, z_low, x_high, y_high, z_high = area[0, 0], area[0, 1], area[0, 2], area[1, 0], area[1, 1], area[1, 2]
+    for j in range(whole_vectors(found)):
+        x, y, z = samples[POSITION_X, j], samples[POSITION_Y, j], samples[POSITION_Z, j]
+        is_inside[j] = (x > x_low) & (x < x_high) & (y > y_low) & (y < y_high) & (z > z_low) & (z < z_high)
+    count = U(0)
+    for j in range(U(found)):
+        chosen[count] = j
+        count += U(is_inside[j])  # a branch would often be mispredicted
+    return count
+
+
+@kernel_part
 def _find_texels(found, group, planes, lanes):
     """Find the texels before each sample in the planes and rows of a group of channels."""
     samples, texels = lanes.samples, lanes.texels
@@ -220,21 +249,23 @@ def _find_texels(found, group, planes, lanes):
 
 
 @kernel_part
-def _accumulate_group(found, group, planes, lanes):
-    """Add what a group of channels contributes to the logits and log densities."""
+def _accumulate_group(count, chosen, group, rows, planes, lanes):
+    """Add what a group of channels contributes to the logits and log densities of the first samples, or those that are
+    `chosen`. `rows` is None where those of the group are 1."""
     samples, texels, firsts = lanes.samples, lanes.texels, planes.firsts
     weights, width = planes.ray_weights.reshape(-1), U(planes.ray_weights.shape[1])
     wide = U(NARROW * len(planes.halves))
     xy, xz, yz = U(firsts[group, 0]), U(firsts[group, 1]), U(firsts[group, 2])
     of_x, of_y, of_z = U(firsts[group, 3]), U(firsts[group, 4]), U(firsts[group, 5])
     up, up_yz = wide * U(planes.sizes[group, 0]), wide * U(planes.sizes[group, 1])
-    for j in range(U(found)):
+    for k in range(U(count)):
+        j = U(k) if chosen is None else U(chosen[k])
         first_weight = U(lanes.weights_of[U(lanes.ray_of[j])]) * width + group * wide * U(CHANNELS)
         accumulate_features(
             planes.planes,
             (xy + wide * U(texels[0, j]), xz + wide * U(texels[1, j]), yz + wide * U(texels[2, j])),
             (up, up, up_yz),
-            planes.rows,
+            rows,
             (of_x + wide * U(texels[3, j]), of_y + wide * U(texels[4, j]), of_z + wide * U(texels[5, j])),
             (samples[FRACTION_X, j], samples[FRACTION_Y, j], samples[FRACTION_Z, j]),
             weights, first_weight, planes.halves, samples, U(LOGIT_RED), j,

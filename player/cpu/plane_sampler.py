@@ -6,6 +6,7 @@ import numpy as np
 
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Scene
+from kpc.player.areas import feature_area
 from kpc.player.atlas import Layout, pad_to_multiple
 from kpc.player.cpu.field_kernels import PlaneArrays, log_densities_at
 from kpc.player.cpu.field_sampler import FieldArrays, FieldSampler, quantised_planes
@@ -31,8 +32,10 @@ class PlaneSampler(FieldSampler):
         self._sizes = np.repeat([texels_along(scale) for scale in scene.scales], groups, axis=0)
         nx, ny, nz = self._sizes.T
         planes, rows = self._wide * np.stack([nx * ny, nx * nz, ny * nz], axis=1), self._wide * self._sizes
+        self._sizes = np.pad(self._sizes, ((0, 0), (0, 1)))  # beside them, whether rows are other than 1
         self._firsts = np.concatenate([_offsets(planes), _offsets(rows)], axis=1)
         self._planes, self._rows = np.zeros(int(planes.sum()), np.int16), np.ones(int(rows.sum()), np.float32)
+        self._areas = np.zeros((len(self._sizes), 2, 3), np.float32)
         hidden = len(decoder.b1) if decoder.w2.any() else 0
         self._w1 = np.ascontiguousarray(decoder.w1[:hidden], np.float32)
         self._b1 = np.asarray(decoder.b1[:hidden], np.float32)
@@ -53,12 +56,17 @@ class PlaneSampler(FieldSampler):
 
     def set_planes(self, atlas: np.ndarray) -> None:
         steps = []
+        used: list[dict[str, np.ndarray]] = [{} for _ in self._channels]
         for block in self._layout.blocks:
-            whole, step = quantised_planes(self._layout.plane(atlas, block)[..., : self._channels[block.scale]])
+            plane = self._layout.plane(atlas, block)[..., : self._channels[block.scale]]
+            used[block.scale][block.plane] = np.any(plane, axis=2)
+            whole, step = quantised_planes(plane)
             for axis in (0, 1):
                 whole = _at_least_two(whole, axis)
             self._put(self._planes, block.scale, SPACE_PLANES.index(block.plane), whole)
             steps.append(step)
+        for scale, planes in enumerate(used):
+            self._areas[self._groups(scale)] = feature_area(planes)
         # The product of three planes is in products of their steps, by which the decoder's weights are the larger.
         count = len(SPACE_PLANES)
         products = [np.prod(steps[first : first + count], axis=0) for first in range(0, len(steps), count)]
@@ -69,14 +77,14 @@ class PlaneSampler(FieldSampler):
         self.time_planes_changed()
 
     def _prepare_time(self, time: float | None) -> None:
+        self._sizes[:, 3], self._rows[:] = 0, 1
         if time is None:
-            self._rows[:] = 1.0
             return
         for number, scale in enumerate(self._scene.scales):
-            for axis, name in enumerate(TIME_PLANES):
-                self._put(
-                    self._rows, number, len(SPACE_PLANES) + axis, _at_least_two(sample_linear(scale[name], time), 0)
-                )
+            rows = [_at_least_two(sample_linear(scale[name], time), 0) for name in TIME_PLANES]
+            self._sizes[self._groups(number), 3] = any((row != 1).any() for row in rows)
+            for axis, row in enumerate(rows):
+                self._put(self._rows, number, len(SPACE_PLANES) + axis, row)
 
     def _arrays(self, worker: int) -> FieldArrays:
         b1 = self._b1 + self._code if len(self._b1) else self._b1
@@ -84,7 +92,7 @@ class PlaneSampler(FieldSampler):
         bias = np.float32(self._scene.decoder.density_bias)
         return None, PlaneArrays(
             tuple(range(0, self._wide, NARROW)), self._planes, self._rows, self._firsts, self._sizes,
-            self._w1, b1, self._scaled_w2, self._scaled_weights, bias, weights,
+            self._areas, self._w1, b1, self._scaled_w2, self._scaled_weights, bias, weights,
         )  # fmt: skip
 
     def log_densities(self, positions: np.ndarray, out: np.ndarray) -> None:
@@ -97,9 +105,14 @@ class PlaneSampler(FieldSampler):
         )
         log_densities_at(positions, self._motion, density_only, out)
 
+    def _groups(self, scale: int) -> slice:
+        """Return the groups of channels of a scale."""
+        return slice(self._first_group[scale], self._first_group[scale + 1])
+
     def _put(self, into: np.ndarray, scale: int, which: int, texels: np.ndarray) -> None:
         """Write (..., channels) texels of a plane or row to their place, group by group."""
-        for number, group in enumerate(range(self._first_group[scale], self._first_group[scale + 1])):
+        groups = self._groups(scale)
+        for number, group in enumerate(range(groups.start, groups.stop)):
             part = texels[..., self._wide * number : self._wide * (number + 1)]
             part = pad_to_multiple(part, texels.ndim - 1, self._wide)
             first = self._firsts[group, which]

@@ -168,7 +168,7 @@ def accumulate_features(
         texels: three uint64, in xy, xz, yz, where the texel before the sample begins; the next along the first axis
             follows it.
         ups: three uint64, distance from there to the next texel along the second axis.
-        rows: (N,) float32; each texel has `wide` numbers.
+        rows: (N,) float32; each texel has `wide` numbers. None where all rows are 1.
         starts: three uint64, in the rows along x, y, z, where the texel before the sample begins.
         shares: three float32, of the way to the next texel along x, y, z.
         weights: (N,) float32.
@@ -179,8 +179,11 @@ def accumulate_features(
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        planes, rows, weights, out = (array_of(context, builder, signature, arguments, n) for n in (0, 3, 6, 9))
+        planes, weights, out = (array_of(context, builder, signature, arguments, n) for n in (0, 6, 9))
         texels, ups, starts, shares = (cgutils.unpack_tuple(builder, arguments[n]) for n in (1, 2, 4, 5))
+        row_data = []
+        if signature.args[3] != types.none:
+            row_data = [array_of(context, builder, signature, arguments, 3).data] * len(starts)
         first, line, column = (arguments[n] for n in (7, 10, 11))
         wide = NARROW * len(signature.args[8])
         one = ir.Constant(FLOAT, 1.0)
@@ -199,9 +202,9 @@ def accumulate_features(
                 floats = [builder.sitofp(whole, vector_type(NARROW)) for whole in wholes]
                 terms = (product(builder, x, factor) for x, (_, factor) in zip(floats, plane, strict=True))
                 factors.append(added(builder, *terms))
-            for start, way in zip(starts, ways, strict=True):
+            for data, start, way in zip(row_data, starts, ways, strict=False):
                 before, behind = (
-                    load(builder, rows.data, builder.add(start, INDEX(half + further)), NARROW) for further in (0, wide)
+                    load(builder, data, builder.add(start, INDEX(half + further)), NARROW) for further in (0, wide)
                 )
                 factors.append(added(builder, before, product(builder, way, builder.fsub(behind, before))))
             feature = reduce(builder.fmul, factors)

@@ -17,7 +17,15 @@ RGBA_UNIT, SUMS_UNIT, STATIC_UNIT = range(3)
 # vec4s of decoder weights that a shader may hold, ten times what the largest preset needs; compilers choke on more.
 MOST_CONSTANTS = 8192
 
+# Renderers that are a processor which stands in for a graphics card.
+SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
+
 AnyProgram = moderngl.Program | moderngl.ComputeShader
+
+
+def is_software(ctx: moderngl.Context) -> bool:
+    """Return whether a processor stands in for a graphics card."""
+    return any(word in ctx.info["GL_RENDERER"].lower() for word in SOFTWARE)
 
 
 class Programs:
@@ -59,6 +67,8 @@ class Programs:
             return self._programs[key]
         scene = self._textures.scene
         macros = {**scene_defines(scene, layout), "COMPUTE": int(compute), "COUNTED": 0, "DEPTH_LIMIT": 0, **defines}
+        if is_software(self.ctx):  # llvmpipe executes both sides of a branch
+            macros |= {f"PART_{scale}": 0 for scale in range(layout.scales)}
         written = {"decoder_weights": self._decoder, "plane_blocks": shader.constants(block_arrays(scene, layout))}
         program: AnyProgram
         vertices = None
@@ -103,7 +113,7 @@ class Programs:
 def scene_defines(scene: Scene, layout: Layout) -> dict[str, int]:
     """Return the macros that describe a scene whose planes lie in a layout."""
     return {
-        **planes_shape(layout),
+        **planes_shape(scene, layout),
         **decoder_shape(scene.decoder),
         "APPEARANCE": int(bool(scene.appearances)),
         "CONTRACTED": int(isinstance(scene.mapping, Contraction)),

@@ -25,7 +25,7 @@ from kpc.player.cpu.reference import Part, Rendering, appearance_code
 from kpc.player.footprint import texels_per_pixel
 from kpc.player.gl.folding import UPSAMPLING, folded_dtype
 from kpc.player.gl.presentation import DisplayMode, Presentation
-from kpc.player.gl.programs import Programs
+from kpc.player.gl.programs import Programs, is_software
 from kpc.player.gl.shader_renderer import ShaderRenderer
 from kpc.player.gl.targets import Target
 from kpc.player.gl.textures import SceneTextures
@@ -44,13 +44,6 @@ COMPUTE_VERSION = 430
 TRIAL_AFTER, TRIALS = 8, 3
 # Samples on a ray that a software driver draws, at most.
 MOST_SAMPLES = 32_000
-# Renderers that are a processor which stands in for a graphics card.
-SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
-
-
-def is_software(ctx: moderngl.Context) -> bool:
-    """Return whether a processor stands in for a graphics card."""
-    return any(word in ctx.info["GL_RENDERER"].lower() for word in SOFTWARE)
 
 
 def tries_compute(ctx: moderngl.Context) -> bool:

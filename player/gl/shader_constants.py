@@ -4,6 +4,7 @@ planes lie."""
 import numpy as np
 
 from kpc.format.scene.scene import AnyDecoder, HybridDecoder, Scene
+from kpc.player.areas import may_be_parts
 from kpc.player.atlas import Layout, pad_to_multiple
 
 
@@ -15,11 +16,13 @@ def decoder_shape(decoder: AnyDecoder) -> dict[str, int]:
     return {"HYBRID": 0, "HIDDEN": len(decoder.b1) if decoder.w2.any() else 0, "HIDDEN_4": 0, "WIDTH_4": 0}
 
 
-def planes_shape(layout: Layout) -> dict[str, int]:
+def planes_shape(scene: Scene, layout: Layout) -> dict[str, int]:
     """Return the macros of march.glsl that describe the planes."""
     layers = {f"LAYERS_{scale}": count for scale, count in enumerate(layout.layers)}
     first = {f"FIRST_{scale}": number for scale, number in enumerate(layout.first_layers)}
-    return {"SCALES": layout.scales, "FEATURES": layout.features, "BASIS": 3 * layout.features} | layers | first
+    parts = {f"PART_{scale}": int(is_part) for scale, is_part in enumerate(may_be_parts(scene))}
+    shape = {"SCALES": layout.scales, "FEATURES": layout.features, "BASIS": 3 * layout.features}
+    return shape | layers | first | parts
 
 
 def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[str, np.ndarray]:

@@ -78,6 +78,7 @@ class ShaderRenderer:
             stride=stride,
             tau=stride / textures.scene.extent,
             termination=quality.termination,
+            areas=[tuple(map(float, corner)) for corner in textures.areas.bounds.reshape(-1, 3)],
             appearance=[tuple(map(float, vector)) for vector in pad_to_multiple(code, 0).reshape(-1, 4)],
             **camera_uniforms(camera),
         )

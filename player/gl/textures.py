@@ -10,6 +10,7 @@ import numpy as np
 from kpc.format.common.errors import DisplayError
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, Scene
+from kpc.player.areas import FeatureAreas
 from kpc.player.atlas import Layout, TimeRows, empty_distances
 from kpc.player.cpu.reference import occupancy_slot
 from kpc.player.gl.targets import allocation
@@ -26,6 +27,7 @@ class SceneTextures:
         planes: the atlas.
         rows: the time rows at the last `set_time_rows`.
         time_rows: the scene's time planes; None for a static scene.
+        areas: of its scales, as far as planes have been put.
 
     Raises:
         DisplayError: the scene does not fit the card.
@@ -36,6 +38,7 @@ class SceneTextures:
         _refuse_too_large(scene, self.layout, ctx.info)
         with allocation(ctx, "the scene"):
             self.planes = plane_texture(ctx, self.layout.size)
+            self.areas = FeatureAreas(scene, self.layout)
             self.time_rows = TimeRows(scene, self.layout) if scene.is_dynamic else None
             width = 1 if self.time_rows is None else self.time_rows.width
             self.rows = plane_texture(ctx, (width, self.layout.line_count))
@@ -52,6 +55,7 @@ class SceneTextures:
     def put(self, scale: int, plane: str, texels: np.ndarray, first: int = 0) -> None:
         """Replace rows of a space plane from row `first` on by `Layout.texels`."""
         block = self.layout.block(scale, plane)
+        self.areas.put(scale, plane, texels, first)
         self.planes.write(texels, viewport=(block.x, block.y + first, texels.shape[1], texels.shape[0]))
 
     def time_planes_changed(self) -> None:

@@ -25,6 +25,7 @@ from scenes import (
     unequal_scales,
     view_independent,
     with_motion,
+    with_moving_area,
     without_planes,
 )
 
@@ -127,14 +128,29 @@ def test_its_memory_is_counted() -> None:
     assert taken == CornerGrid.bytes_for(grid._scene) == grid.memory_bytes
 
 
-def test_a_picture_does_not_depend_on_the_ones_before() -> None:
-    scene = with_motion(view_independent(tiny_scene(4, channels=16)))
+@pytest.mark.parametrize("space", ["displaced", "moving area"])
+def test_a_picture_does_not_depend_on_the_ones_before(space: str) -> None:
+    scene = VARIANTS[space](view_independent(tiny_scene(4, channels=16)))
     renderer = Renderer(gl.context(), scene, LEVELS["balanced"], processor=True)
     for time in (0.1, 0.11, 0.7, 0.12):
         got = renderer.render(CAMERA, time)
     np.testing.assert_array_equal(
         got.rgb, Renderer(gl.context(), scene, LEVELS["balanced"], processor=True).render(CAMERA, 0.12).rgb
     )
+
+
+def test_corners_at_which_nothing_moves_are_kept() -> None:
+    renderer = Renderer(
+        gl.context(), with_moving_area(view_independent(tiny_scene(4, channels=16))), WITH_GRID, processor=True
+    )
+    renderer.march(CAMERA, 0.5)
+    grid = renderer._processor._sampler(CornerGrid)
+    before = grid._known.any(0)
+    grid.prepare(0.6, np.empty(0, np.float32))
+    kept = grid._known.any(0)
+    assert 0.1 * before.sum() < kept.sum() < before.sum()
+    inside = tuple(slice(side // 3, 2 * side // 3) for side in before.shape)
+    assert before[inside].any() and not kept[inside].any() and (kept[:, 0] == before[:, 0]).all()
 
 
 def test_planes_that_arrive_later_are_drawn() -> None:

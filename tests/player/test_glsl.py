@@ -8,7 +8,7 @@ from kpc.format.scene.motion import displace
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT
 from kpc.format.scene.space import Contraction, contract
 from kpc.player.cpu.reference import sigmoid
-from kpc.player.gl.renderer import is_software
+from kpc.player.gl.programs import is_software
 from scenes import look_at
 
 N = 1 << 16

@@ -64,7 +64,7 @@ FRAGMENTS = ("march", "cells", "upsample_plane", "fold", "present", "upscale", "
 @pytest.mark.parametrize("name", [*(f"{name}.glsl" for name in FRAGMENTS), "fullscreen.glsl"])
 def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
     scene = tiny_scene(0)
-    defines = {**planes_shape(Layout.of(scene)), **decoder_shape(scene.decoder)}
+    defines = {**planes_shape(scene, Layout.of(scene)), **decoder_shape(scene.decoder)}
     text, files = shader.compose(
         name, defines, written={"decoder_weights": "", "plane_blocks": ""}, language=shader.Language.WEB
     )
@@ -127,7 +127,7 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
         "DEPTH_LIMIT": rows,
     }
     defines |= {"CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc")}
-    defines |= {**planes_shape(layout), **decoder_shape(scene.decoder)}
+    defines |= {**planes_shape(scene, layout), **decoder_shape(scene.decoder)}
     fragment, _ = shader.compose(
         name, defines, shader.Language.WEB, {"decoder_weights": weights, "plane_blocks": blocks}
     )

@@ -13,7 +13,8 @@ from kpc.encoder.cli import kpenc
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.render import Rays, render_reference
 from kpc.format.common.errors import DisplayError
-from kpc.player.gl.renderer import MOST_SAMPLES, Renderer, is_software
+from kpc.player.gl.programs import is_software
+from kpc.player.gl.renderer import MOST_SAMPLES, Renderer
 from kpc.tools.bench import kpbench, plot, results, tables
 from kpc.tools.bench.stability import pictures, stages, sweeps
 from kpc.tools.bench.stability.sweeps import Sweep

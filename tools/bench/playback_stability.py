@@ -21,7 +21,7 @@ from kpc.player.app.resolution_controller import ResolutionController
 from kpc.player.app.window import Window
 from kpc.player.cpu import loading
 from kpc.player.gl import offscreen
-from kpc.player.gl.renderer import is_software
+from kpc.player.gl.programs import is_software
 from kpc.player.streaming.group_playback import GroupPlayback
 
 # The methods of a moderngl context that create an object on the graphics card.

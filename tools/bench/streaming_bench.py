@@ -25,7 +25,8 @@ from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import TIME_PLANES, Clip
 from kpc.player.app.resolution_controller import ResolutionController
 from kpc.player.gl import offscreen
-from kpc.player.gl.renderer import Renderer, is_software
+from kpc.player.gl.programs import is_software
+from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import Quality
 from kpc.player.streaming.prefetch import Playhead, min_segment_bytes
 from kpc.player.streaming.stream import Stream

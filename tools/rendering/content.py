@@ -70,7 +70,8 @@ def _what_moves(scene: Scene, picture: Rendering, share: np.ndarray, content: st
 
 def _gl_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
     from kpc.player.gl import offscreen  # here, since the reference backend works without moderngl
-    from kpc.player.gl.renderer import Renderer, is_software
+    from kpc.player.gl.programs import is_software
+    from kpc.player.gl.renderer import Renderer
 
     ctx = offscreen.open_context()
     is_slow = is_software(ctx) and not LEVELS[options.quality].folded  # pixels of other levels depend on others

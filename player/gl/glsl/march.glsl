@@ -1,7 +1,7 @@
 // The picture of a scene; normative text and a readable twin: kpc.player.cpu.reference.
 //
-// LAYERS_n, FIRST_n: layers of four channels of scale n, and the first among those of all; FEATURES: layers of all;
-// BASIS: three times as many. HIDDEN: hidden units of the colour's direction layer, 0 for view-independent colour.
+// LAYERS_n, FIRST_n: layers of four channels of scale n, and the first among those of all; PART_n: 1 where it is not
+// looked up outside its area. FEATURES: layers of all; BASIS: three times as many. HIDDEN: hidden units of the colour's direction layer, 0 for view-independent colour.
 // HYBRID: 1 for the hybrid decoder, of layers of WIDTH and HIDDEN units. APPEARANCE: 1 where colours come in more than
 // one appearance. ROWS: 1 where time rows are multiplied in at every sample. CONTRACTED: 1 where the planes hold what
 // lies outside the box, too. MOTION: 1 where samples are displaced. NDC: 1 where all this is in normalised device
@@ -35,6 +35,7 @@ uniform vec3 nodes;                 // MOTION: of its grid along x, y, z
 uniform vec3 box_low;
 uniform vec3 box_high;
 uniform vec3 background;
+uniform vec3 areas[2 * SCALES];     // between which the features of each scale may be other than 0
 uniform float stride;
 uniform float uniform_distance;                 // CONTRACTED: how far along a ray samples are evenly spaced
 uniform mat4x3 frame;               // NDC: of its camera
@@ -127,6 +128,11 @@ vec4 feature(vec3 u, int scale, int layer) {
     return f;
 }
 
+// Whether the features of a scale may be other than 0.
+bool is_in_area(vec3 u, int scale) {
+    return all(greaterThan(u, areas[2 * scale])) && all(lessThan(u, areas[2 * scale + 1]));
+}
+
 #if HYBRID
 // A weight below which a sample's colour is not worked out but grey: 4096 of them are not off by more than half an
 // 8-bit level.
@@ -167,8 +173,16 @@ vec4 hybrid_logits_of(vec3 u, float trans, float thickness) {
     vec4 f[FEATURES];
 #unroll scale SCALES
 #unroll layer LAYERS_##scale
-    f[FIRST_##scale + layer] = feature(u, scale, layer);
+    f[FIRST_##scale + layer] = vec4(0.0);
 #end
+#if PART_##scale
+    if (is_in_area(u, scale))
+#endif
+    {
+#unroll layer LAYERS_##scale
+        f[FIRST_##scale + layer] = feature(u, scale, layer);
+#end
+    }
 #end
     vec4 h[WIDTH / 4];
     float log_density = density_bias[0].x;
@@ -185,11 +199,16 @@ vec4 hybrid_logits_of(vec3 u, float trans, float thickness) {
 vec4 logits_of(vec3 u) {
     vec4 sum = vec4(vec3(0.0), density_bias[0].x), f;
 #unroll scale SCALES
+#if PART_##scale
+    if (is_in_area(u, scale))
+#endif
+    {
 #unroll layer LAYERS_##scale
-    f = feature(u, scale, layer);
-    sum += vec4(dot(f, basis[FIRST_##scale + layer]), dot(f, basis[FEATURES + FIRST_##scale + layer]),
-                dot(f, basis[2 * FEATURES + FIRST_##scale + layer]), dot(f, density_weight[FIRST_##scale + layer]));
+        f = feature(u, scale, layer);
+        sum += vec4(dot(f, basis[FIRST_##scale + layer]), dot(f, basis[FEATURES + FIRST_##scale + layer]),
+                    dot(f, basis[2 * FEATURES + FIRST_##scale + layer]), dot(f, density_weight[FIRST_##scale + layer]));
 #end
+    }
 #end
     return sum;
 }

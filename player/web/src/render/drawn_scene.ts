@@ -115,6 +115,7 @@ export class DrawnScene {
       stride,
       tau: stride / extentOf(this.source),
       termination: quality.termination,
+      areas: textures.areas.bounds,
       background: shot.background,
       appearance: paddedCode(appearance, this.source.decoder.hidden),
       width: camera.width,

@@ -1,5 +1,6 @@
 /** The textures of a scene, and the programs that read them. */
 
+import { FeatureAreas } from './areas.js';
 import { displacementsAt, Layout, rowWidth, timeRows } from './atlas.js';
 import { columnsOf } from './camera.js';
 import { RenderError } from './context.js';
@@ -31,6 +32,8 @@ export class SceneTextures {
   readonly rows: Texture;
   readonly cells: Texture;
   readonly motion: Texture | null = null;
+  /** Of the scales, as far as planes have been put. */
+  readonly areas: FeatureAreas;
   /** The slot whose cells are there, and whether with their distances. */
   #slot = '';
   /** Time and version of the rows. */
@@ -44,6 +47,7 @@ export class SceneTextures {
     const { occupancy, motion, head } = scene;
     this.layout = new Layout(scene);
     this.#refuseTooLarge();
+    this.areas = new FeatureAreas(scene, this.layout);
     this.planes = device.texture(device.planeFormat, [this.layout.width, this.layout.height], true);
     const filtered = device.filtersFloat32 ? 'rgba32f' : 'rgba16f';
     this.rows = device.texture(filtered, [head.isDynamic ? rowWidth(scene) : 1, this.layout.lineCount], true);
@@ -52,7 +56,9 @@ export class SceneTextures {
   }
 
   /** Replace rows of a space plane. */
-  put({ scale, plane, firstRow, rowCount, texels }: PlaneRows): void {
+  put(rows: PlaneRows): void {
+    const { scale, plane, firstRow, rowCount, texels } = rows;
+    this.areas.put(rows);
     const { x, y, width } = this.layout.block(scale, plane as SpacePlane);
     this.device.write(this.planes, texels, x, y + firstRow, [width * this.layout.layers[scale], rowCount]);
   }
@@ -119,7 +125,7 @@ export class SceneTextures {
 /** Return the macros that describe a scene whose planes lie in a layout. */
 export function sceneDefines(scene: SceneSource, layout: Layout): Defines {
   return {
-    ...planesShape(layout),
+    ...planesShape(scene, layout),
     ...decoderShape(scene.decoder),
     APPEARANCE: Number(scene.appearances.length > 0),
     CONTRACTED: Number(scene.mapping?.mapping === 1),

@@ -1,6 +1,7 @@
 /** What the shaders of a scene are compiled with: the twin of kpc.player.gl.shader_constants. */
 
 import type { DecoderWeights } from '../container/scene_chunks.js';
+import { mayBeParts } from './areas.js';
 import type { Layout } from './atlas.js';
 import { headOf, type SceneSource } from './scene_source.js';
 import type { ConstantArray, Defines } from './shader.js';
@@ -11,11 +12,13 @@ const roundUp = (n: number) => 4 * Math.ceil(n / 4);
 const isViewDependent = (decoder: DecoderWeights) => decoder.weights.w2.some((weight) => weight !== 0);
 
 /** Return the macros that describe the planes. */
-export function planesShape(layout: Layout): Defines {
+export function planesShape(scene: SceneSource, layout: Layout): Defines {
   const layers = layout.layers.map((count, scale) => [`LAYERS_${scale}`, count]);
   const first = layout.firstLayers.map((number, scale) => [`FIRST_${scale}`, number]);
   const { scales, features } = layout;
-  return { SCALES: scales, FEATURES: features, BASIS: 3 * features, ...Object.fromEntries([...layers, ...first]) };
+  const parts = mayBeParts(scene).map((isPart, scale) => [`PART_${scale}`, Number(isPart)]);
+  const each = Object.fromEntries([...layers, ...first, ...parts]);
+  return { SCALES: scales, FEATURES: features, BASIS: 3 * features, ...each };
 }
 
 /** Return the macros that describe the decoder; HIDDEN is 0 for view-independent colour. */
