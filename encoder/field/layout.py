@@ -18,6 +18,9 @@ AXES = "xyzt"
 # if they covered the box.
 MOST_FINER = 3.0
 
+# Rows of a plane that lie so far apart in it follow each other in `Layout.plane_rows`.
+DEALT = 64
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -71,6 +74,20 @@ class Layout:
     def is_uniform(self) -> bool:
         """Whether all scales cover the box, and have the same planes."""
         return bool((self.held == self.resolution).all() and len(set((self.resolution[:, 3] > 0).tolist())) == 1)
+
+    @functools.cached_property
+    def plane_rows(self) -> np.ndarray:
+        """(R, 5) int64: for each row of a plane where the plane begins in theta, the number of the row, how many rows
+        and columns the plane has, and 1 for a space-time plane.
+
+        The rows of a plane are far apart, so that threads, which take rows that follow each other, have as much to do.
+        """
+        rows = [
+            (start, row, count, columns, int(name in TIME_PLANES))
+            for _, name, start, count, columns in self.planes()
+            for row in range(count)
+        ]
+        return np.array([row for first in range(DEALT) for row in rows[first::DEALT]], np.int64)
 
     def has(self, scale: int, name: str) -> bool:
         """Return whether a scale has a plane."""

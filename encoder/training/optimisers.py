@@ -11,7 +11,6 @@ from kpc.encoder.field import kernels
 from kpc.encoder.field.adam import Adam
 from kpc.encoder.field.config import TrainConfig, Variation
 from kpc.encoder.field.field import Field
-from kpc.format.scene.scene import SPACE_PLANES
 
 # Adam's constants as Instant-NGP sets them for grids (arXiv:2201.05989, section 4).
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
@@ -57,16 +56,17 @@ def add_prior_gradients(
     field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainConfig, variation: Variation, factor: float
 ) -> None:
     """Add `factor` times the gradient of `kpc.encoder.field.priors.plane_priors` at theta (n,) to grad (n,)."""
-    M = field.layout.channels
-    space, transient, steep = factor * variation.space, factor * variation.transient, variation.steep
-    for _, name, start, rows, columns in field.layout.planes():
-        if name in SPACE_PLANES:
-            kernels.add_variation(theta, grad, start, rows, columns, M, space, space, steep)
-            continue
-        kernels.add_variation(theta, grad, start, rows, columns, M, transient, 0.0, steep)
-        kernels.add_time_smoothness(theta, grad, start, rows, columns, M, factor * config.time_smoothness)
-        size = rows * columns * field.layout.channels
-        kernels.add_sparse_transients(theta, grad, start, size, factor * config.sparse_transients)
+    kernels.add_priors(
+        theta,
+        grad,
+        field.layout.plane_rows,
+        field.layout.channels,
+        factor * variation.space,
+        factor * variation.transient,
+        factor * config.time_smoothness,
+        factor * config.sparse_transients,
+        variation.steep,
+    )
 
 
 def total(weighted: dict[str, torch.Tensor]) -> torch.Tensor:

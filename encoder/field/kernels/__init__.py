@@ -33,7 +33,7 @@ from kpc.encoder.field.kernels.backward import backpropagate
 from kpc.encoder.field.kernels.marching import collect_samples, render
 from kpc.encoder.field.kernels.points import features, log_densities, scatter_features
 from kpc.encoder.field.kernels.texels import AXES, PLACES
-from kpc.encoder.field.kernels.updates import adam, add_sparse_transients, add_time_smoothness, add_variation
+from kpc.encoder.field.kernels.updates import adam, add_priors
 
 __all__ = [
     "AXES",
@@ -45,9 +45,7 @@ __all__ = [
     "SampleArrays",
     "Volume",
     "adam",
-    "add_sparse_transients",
-    "add_time_smoothness",
-    "add_variation",
+    "add_priors",
     "backpropagate",
     "collect_samples",
     "features",

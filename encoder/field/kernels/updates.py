@@ -53,64 +53,72 @@ def robust_slope(difference, steep):
 
 
 @parallel
-def add_variation(theta, grad, start, rows, columns, M, along_rows, across_rows, steep):
-    """Add the gradient of the (robust) total variation of one plane.
+def add_priors(theta, grad, rows, M, space, transient, time_smoothness, sparse_transients, steep):
+    """Add the gradient of the priors on planes, `kpc.encoder.field.priors.plane_priors`.
+
+    All planes are one loop: where other programs keep a core busy, each start of the threads may wait for it.
+
+    Args:
+        theta, grad: (n,) float32.
+        rows: (R, 5) int64, for each row of a plane where the plane begins in theta, the number of the row, how many
+            rows and columns the plane has, and 1 for a space-time plane.
+        M: channels.
+        space, transient, time_smoothness, sparse_transients: weights.
+        steep: of the robust total variation, >= 0.
+    """
+    steep = np.float32(steep)
+    for n in prange(len(rows)):
+        start, row, count, width = rows[n, 0], rows[n, 1], rows[n, 2], rows[n, 3] * M
+        here, size = start + row * width, count * width
+        if rows[n, 4] == 0:
+            weight = np.float32(2.0 * space / size)
+            _add_variation_along(theta, grad, here, width, M, weight, steep)
+            if row > 0:
+                _add_variation_across(theta, grad, here, here - width, width, weight, steep)
+            if row < count - 1:
+                _add_variation_across(theta, grad, here, here + width, width, weight, steep)
+        else:
+            _add_variation_along(theta, grad, here, width, M, np.float32(2.0 * transient / size), steep)
+            weight = np.float32(2.0 * time_smoothness / size)
+            for centre in range(max(row - 1, 1), min(row + 2, count - 1)):
+                factor = weight * np.float32(-2.0) if centre == row else weight
+                _add_time_smoothness(theta, grad, here, start + centre * width, width, factor)
+            _add_sparse_transients(theta, grad, here, width, np.float32(sparse_transients / size))
+
+
+@inlined
+def _add_variation_along(theta, grad, here, width, M, weight, steep):
+    """Add the gradient of the (robust) total variation along a row that begins at `here`.
 
     The loss is the mean over texels and channels of rho(d), d being differences between neighbours, where
     rho(d) = log(1 + steep d^2) / steep, or d^2 where `steep` is 0.
-
-    Args:
-        theta, grad: (n,) float32. start, rows, columns, M: which part of theta is the plane, (rows, columns, M).
-        along_rows: weight of differences between neighbours in a row. A space-time plane is smoothed along rows alone.
-        across_rows: weight of differences between neighbours in a column.
-        steep: >= 0.
     """
-    width, steep = columns * M, np.float32(steep)
-    along, across = np.float32(2.0 * along_rows / (rows * width)), np.float32(2.0 * across_rows / (rows * width))
-    for row in prange(rows):
-        a = start + row * width
-        here = theta[a : a + width]
-        out = grad[a : a + width]
-        for i in range(M, width):
-            out[i] += along * robust_slope(here[i] - here[i - M], steep)
-        for i in range(width - M):
-            out[i] += along * robust_slope(here[i] - here[i + M], steep)
-        if across == 0:
-            continue
-        if row > 0:
-            above = theta[a - width : a]
-            for i in range(width):
-                out[i] += across * robust_slope(here[i] - above[i], steep)
-        if row < rows - 1:
-            below = theta[a + width : a + 2 * width]
-            for i in range(width):
-                out[i] += across * robust_slope(here[i] - below[i], steep)
+    for i in range(here + M, here + width):
+        grad[i] += weight * robust_slope(theta[i] - theta[i - M], steep)
+    for i in range(here, here + width - M):
+        grad[i] += weight * robust_slope(theta[i] - theta[i + M], steep)
 
 
-@parallel
-def add_time_smoothness(theta, grad, start, rows, columns, M, weight):
-    """Add the gradient of weight * mean of (P[t-1] - 2 P[t] + P[t+1])^2 (K-Planes, section 3.2)."""
-    width = columns * M
-    k = np.float32(2.0 * weight / (rows * columns * M))
-    for row in prange(rows):
-        out = grad[start + row * width : start + (row + 1) * width]
-        for centre in range(max(row - 1, 1), min(row + 2, rows - 1)):
-            c = start + centre * width
-            before, here, after = theta[c - width : c], theta[c : c + width], theta[c + width : c + 2 * width]
-            factor = k * np.float32(-2.0) if centre == row else k
-            for i in range(width):
-                out[i] += factor * (before[i] - np.float32(2.0) * here[i] + after[i])
+@inlined
+def _add_variation_across(theta, grad, here, beside, width, weight, steep):
+    """Add the same between a row and the one that begins at `beside`."""
+    for i in range(width):
+        grad[here + i] += weight * robust_slope(theta[here + i] - theta[beside + i], steep)
 
 
-@parallel
-def add_sparse_transients(theta, grad, start, size, weight):
-    """Add the gradient of weight * mean |1 - P| (K-Planes, section 3.2); it is 0 at the kink, P = 1."""
-    k = np.float32(weight / size)
-    for block in prange((size + (BLOCK - 1)) // BLOCK):
-        lo, hi = start + block * BLOCK, start + min((block + 1) * BLOCK, size)
-        here, out = theta[lo:hi], grad[lo:hi]
-        for i in range(hi - lo):
-            if here[i] > np.float32(1.0):
-                out[i] += k
-            elif here[i] < np.float32(1.0):
-                out[i] -= k
+@inlined
+def _add_time_smoothness(theta, grad, here, centre, width, factor):
+    """Add the gradient of (P[t-1] - 2 P[t] + P[t+1])^2 (K-Planes, section 3.2), t being the row at `centre`."""
+    for i in range(width):
+        c = centre + i
+        grad[here + i] += factor * (theta[c - width] - np.float32(2.0) * theta[c] + theta[c + width])
+
+
+@inlined
+def _add_sparse_transients(theta, grad, here, width, weight):
+    """Add the gradient of |1 - P| (K-Planes, section 3.2); it is 0 at the kink, P = 1."""
+    for i in range(here, here + width):
+        if theta[i] > np.float32(1.0):
+            grad[i] += weight
+        elif theta[i] < np.float32(1.0):
+            grad[i] -= weight
