@@ -52,9 +52,9 @@ def encode(options: Options) -> dict[str, Any]:
         KeyboardInterrupt: stopped by the user; the checkpoint is kept.
     """
     with working_alone(options):
-        return (
-            encode_groups(options) if options.group_s is not None else encode_scene(options, prepare_setting(options))
-        )
+        if options.group_s is not None:
+            return encode_groups(options)
+        return encode_scene(options, prepare_setting(options))
 
 
 def dry_run(options: Options) -> Estimate:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kpc.encoder.field.layout import AXES, Layout, border_elements
+from kpc.encoder.field.layout import AXES, Layout, border_elements, resolution_of
 from kpc.encoder.field.sampling import WeightedRowSum, bilinear_corners, displace
 from kpc.format.scene.scene import (
     ACTIVATION_LIMIT,
@@ -270,17 +270,8 @@ class Field(nn.Module):
         columns, rows = (max(int(layout.resolution[scale, axis]), FEWEST_ROWS) for axis in axes)
         whole = np.full((rows, columns, layout.channels), float(name in TIME_PLANES), np.float32)
         if layout.has(scale, name):
-            whole[self._held(scale, name)] = _array(self.plane(scale, name))
+            whole[layout.rectangle(scale, name)] = _array(self.plane(scale, name))
         return whole
-
-    def _held(self, scale: int, name: str) -> tuple[slice, slice]:
-        """Return which rows and columns of a plane of the whole box are held."""
-        axes = [AXES.index(axis) for axis in reversed(name)]
-        first = [int(self.layout.first[scale, axis]) if axis < 3 else 0 for axis in axes]
-        rows, columns = (
-            slice(at, at + int(self.layout.held[scale, axis])) for at, axis in zip(first, axes, strict=True)
-        )
-        return rows, columns
 
     @staticmethod
     def from_scene(scene: Scene, layout: Layout | None = None) -> "Field":
@@ -295,11 +286,9 @@ class Field(nn.Module):
         if any(min(plane.shape[:2]) < 2 for scale in scene.scales for plane in scale.values()):
             raise ValueError("a plane has a single texel along an axis")
         if layout is None:
-            resolution = []
-            for scale in scene.scales:
-                rows_t = scale["xt"].shape[0] if scene.is_dynamic else 0
-                resolution.append([scale["xy"].shape[1], scale["xy"].shape[0], scale["xz"].shape[0], rows_t])
-            layout = Layout.of(np.array(resolution), scene.scales[0]["xy"].shape[2])
+            layout = Layout.of(
+                np.array([resolution_of(scale) for scale in scene.scales]), scene.scales[0]["xy"].shape[2]
+            )
         kind = HybridField if isinstance(scene.decoder, HybridDecoder) else Field
         field = kind(
             layout,
@@ -309,7 +298,7 @@ class Field(nn.Module):
         )
         with torch.no_grad():
             for s, name, *_ in layout.planes():
-                _fill(field.plane(s, name), scene.scales[s][name][field._held(s, name)])
+                _fill(field.plane(s, name), scene.scales[s][name][layout.rectangle(s, name)])
             if field.motion is not None and scene.motion is not None:
                 _fill(field.motion, scene.motion)
             if field.codes is not None:

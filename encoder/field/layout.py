@@ -89,6 +89,13 @@ class Layout:
         ]
         return np.array([row for first in range(DEALT) for row in rows[first::DEALT]], np.int64)
 
+    def rectangle(self, scale: int, name: str) -> tuple[slice, slice]:
+        """Return which rows and columns of a plane of the whole box are held."""
+        axes = [AXES.index(axis) for axis in reversed(name)]
+        first = [int(self.first[scale, axis]) if axis < 3 else 0 for axis in axes]
+        rows, columns = (slice(at, at + int(self.held[scale, axis])) for at, axis in zip(first, axes, strict=True))
+        return rows, columns
+
     def has(self, scale: int, name: str) -> bool:
         """Return whether a scale has a plane."""
         return bool(self.table[scale, ALL_PLANES.index(name)] >= 0)
@@ -130,6 +137,11 @@ def plan_layout(config: TrainConfig, aabb: np.ndarray, clip: Clip, is_dynamic: b
     return Layout.of(np.array(resolution), config.channels)
 
 
+def resolution_of(scale: Mapping[str, np.ndarray]) -> list[int]:
+    """Return the texels of a scene's scale along x, y, z and t, 0 without space-time planes."""
+    return [scale["xy"].shape[1], *scale["yz"].shape[1::-1], len(scale["xt"]) if "xt" in scale else 0]
+
+
 def layout_of_planes(scales: Sequence[Mapping[str, np.ndarray]]) -> Layout:
     """Return a layout for planes of a scene that leaves out what its features do not depend on.
 
@@ -142,9 +154,9 @@ def layout_of_planes(scales: Sequence[Mapping[str, np.ndarray]]) -> Layout:
     moves = [any((scale[name] != 1).any() for name in TIME_PLANES if name in scale) for scale in scales]
     resolution, spans = [], []
     for scale, is_moving in zip(scales, moves, strict=True):
-        size = np.array([scale["xy"].shape[1], *scale["yz"].shape[1::-1]])
-        has_rows = "xt" in scale and (is_moving or not any(moves))
-        resolution.append([*size, len(scale["xt"]) if has_rows else 0])
+        *axes, rows = resolution_of(scale)
+        size = np.array(axes)
+        resolution.append([*axes, rows if is_moving or not any(moves) else 0])
         texels = area_texels({name: np.any(scale[name], axis=2) for name in SPACE_PLANES})
         first, last = np.stack([0 * size, size - 1]) if texels is None else texels.T
         first, last = np.maximum(first - 1, 0), np.minimum(last + 1, size - 1)
