@@ -31,6 +31,14 @@ class FeatureAreas:
             self._used[scale] = {block.plane: np.zeros((block.height, block.width), bool) for block in blocks}
             self.bounds[scale] = feature_area(self._used[scale])
 
+    @staticmethod
+    def of_atlas(scene: Scene, layout: Layout, atlas: np.ndarray) -> "FeatureAreas":
+        """Return the areas by all planes of a (height, width, 4) atlas."""
+        areas = FeatureAreas(scene, layout)
+        for block in layout.blocks:
+            areas.put(block.scale, block.plane, layout.cut(atlas, block))
+        return areas
+
     def put(self, scale: int, plane: str, texels: np.ndarray, first: int = 0) -> None:
         """Take note of rows of a space plane from row `first` on, as `Layout.texels` gives them."""
         if scale not in self._used:

@@ -111,11 +111,14 @@ class Layout:
     def block(self, scale: int, plane: str) -> Block:
         return self.blocks[3 * scale + SPACE_PLANES.index(plane)]
 
+    def cut(self, atlas: np.ndarray, block: Block) -> np.ndarray:
+        """Return a view of a block of a (height, width, 4) atlas: `texels` of its plane."""
+        columns = self.layers[block.scale] * block.width
+        return atlas[block.y : block.y + block.height, block.x : block.x + columns]
+
     def plane(self, atlas: np.ndarray, block: Block) -> np.ndarray:
         """Return the plane of a block of a (height, width, 4) atlas: (rows, columns, 4 layers)."""
-        columns = self.layers[block.scale] * block.width
-        texels = atlas[block.y : block.y + block.height, block.x : block.x + columns]
-        plane = texels.reshape(block.height, -1, block.width, 4).swapaxes(1, 2)
+        plane = self.cut(atlas, block).reshape(block.height, -1, block.width, 4).swapaxes(1, 2)
         return np.ascontiguousarray(plane).reshape(*plane.shape[:2], -1)
 
     def lines(self, block: Block) -> slice:

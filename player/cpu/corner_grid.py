@@ -11,7 +11,7 @@ import numpy as np
 from kpc.format.scene.areas import AXES
 from kpc.format.scene.grid import sample_linear, texel_and_fraction
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Scene
-from kpc.player.areas import feature_area
+from kpc.player.areas import FeatureAreas
 from kpc.player.atlas import Layout, pad_to_multiple
 from kpc.player.cpu.field_kernels import CornerGridArrays
 from kpc.player.cpu.field_sampler import FieldArrays, FieldSampler, quantised_planes
@@ -36,7 +36,7 @@ class CornerGrid(FieldSampler):
         self._known = np.zeros((WORKERS, *self.values.shape[:3]), np.uint8)
         self._channels = [scale["xy"].shape[2] for scale in scene.scales]
         self._planes: tuple[np.ndarray, ...] = ()
-        # Of each scale, where it counts (`feature_area`), and whether it moved at the last time.
+        # Where each scale counts (`kpc.player.areas.feature_area`), and whether it moved at the last time.
         self._areas = np.zeros((len(self._channels), 2, 3), np.float32)
         self._moved = np.zeros(len(self._channels), bool)
         self._rows: tuple[np.ndarray, ...] = ()
@@ -58,10 +58,8 @@ class CornerGrid(FieldSampler):
 
     def set_planes(self, atlas: np.ndarray) -> None:
         planes: dict[str, list[np.ndarray]] = {name: [] for name in SPACE_PLANES}
-        used: list[dict[str, np.ndarray]] = [{} for _ in self._channels]
         for block in self._layout.blocks:
             plane = self._layout.plane(atlas, block)[..., : self._channels[block.scale]]
-            used[block.scale][block.plane] = np.any(plane, axis=2)
             across = self._at_corners(plane.swapaxes(0, 1), block.plane[0])
             planes[block.plane].append(self._at_corners(across.swapaxes(0, 1), block.plane[1]))
         weights, quantised = self._weights.astype(np.float64), []
@@ -72,7 +70,7 @@ class CornerGrid(FieldSampler):
             weights = weights * step
         self._planes = tuple(quantised)
         self._scaled_weights = np.clip(weights, -LARGEST, LARGEST).astype(np.float32)
-        self._areas = np.stack([feature_area(planes) for planes in used])
+        self._areas = FeatureAreas.of_atlas(self._scene, self._layout, atlas).bounds
         self.time_planes_changed()
 
     def time_planes_changed(self) -> None:

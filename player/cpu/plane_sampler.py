@@ -6,7 +6,7 @@ import numpy as np
 
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Scene
-from kpc.player.areas import feature_area
+from kpc.player.areas import FeatureAreas
 from kpc.player.atlas import Layout, pad_to_multiple
 from kpc.player.cpu.field_kernels import PlaneArrays, log_densities_at
 from kpc.player.cpu.field_sampler import FieldArrays, FieldSampler, quantised_planes
@@ -56,17 +56,14 @@ class PlaneSampler(FieldSampler):
 
     def set_planes(self, atlas: np.ndarray) -> None:
         steps = []
-        used: list[dict[str, np.ndarray]] = [{} for _ in self._channels]
         for block in self._layout.blocks:
-            plane = self._layout.plane(atlas, block)[..., : self._channels[block.scale]]
-            used[block.scale][block.plane] = np.any(plane, axis=2)
-            whole, step = quantised_planes(plane)
+            whole, step = quantised_planes(self._layout.plane(atlas, block)[..., : self._channels[block.scale]])
             for axis in (0, 1):
                 whole = _at_least_two(whole, axis)
             self._put(self._planes, block.scale, SPACE_PLANES.index(block.plane), whole)
             steps.append(step)
-        for scale, planes in enumerate(used):
-            self._areas[self._groups(scale)] = feature_area(planes)
+        for scale, area in enumerate(FeatureAreas.of_atlas(self._scene, self._layout, atlas).bounds):
+            self._areas[self._groups(scale)] = area
         # The product of three planes is in products of their steps, by which the decoder's weights are the larger.
         count = len(SPACE_PLANES)
         products = [np.prod(steps[first : first + count], axis=0) for first in range(0, len(steps), count)]

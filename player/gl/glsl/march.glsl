@@ -1,7 +1,8 @@
 // The picture of a scene; normative text and a readable twin: kpc.player.cpu.reference.
 //
 // LAYERS_n, FIRST_n: layers of four channels of scale n, and the first among those of all; PART_n: 1 where it is not
-// looked up outside its area. FEATURES: layers of all; BASIS: three times as many. HIDDEN: hidden units of the colour's direction layer, 0 for view-independent colour.
+// looked up outside its area. FEATURES: layers of all; BASIS: three times as many. HIDDEN: hidden units of the colour's
+// direction layer, 0 for view-independent colour.
 // HYBRID: 1 for the hybrid decoder, of layers of WIDTH and HIDDEN units. APPEARANCE: 1 where colours come in more than
 // one appearance. ROWS: 1 where time rows are multiplied in at every sample. CONTRACTED: 1 where the planes hold what
 // lies outside the box, too. MOTION: 1 where samples are displaced. NDC: 1 where all this is in normalised device
@@ -172,10 +173,10 @@ vec3 shade_of(vec4 h[WIDTH / 4]) {
 vec4 hybrid_logits_of(vec3 u, float trans, float thickness) {
     vec4 f[FEATURES];
 #unroll scale SCALES
+#if PART_##scale
 #unroll layer LAYERS_##scale
     f[FIRST_##scale + layer] = vec4(0.0);
 #end
-#if PART_##scale
     if (is_in_area(u, scale))
 #endif
     {

@@ -10,7 +10,7 @@ const EMPTY = [ABOVE, ABOVE, ABOVE, BELOW, BELOW, BELOW];
 
 /** The areas of a scene's scales, as far as its space planes have been put; those made for the whole box have that. */
 export class FeatureAreas {
-  /** Of each scale the positions along x, y, z in [0, 1] between which its features may be other than 0: 6 numbers. */
+  /** Positions along x, y, z in [0, 1] between which features may be other than 0: 6 numbers for each scale. */
   readonly bounds: Float32Array;
   /** Whether a texel [row][column] is other than 0 in a channel, of the scales that may be parts. */
   readonly #used: (Record<SpacePlane, Uint8Array> | null)[];

@@ -32,7 +32,7 @@ export class SceneTextures {
   readonly rows: Texture;
   readonly cells: Texture;
   readonly motion: Texture | null = null;
-  /** Of the scales, as far as planes have been put. */
+  /** Areas of the scales, as far as planes have been put. */
   readonly areas: FeatureAreas;
   /** The slot whose cells are there, and whether with their distances. */
   #slot = '';
