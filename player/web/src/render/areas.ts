@@ -10,8 +10,9 @@ const EMPTY = [ABOVE, ABOVE, ABOVE, BELOW, BELOW, BELOW];
 
 /** The areas of a scene's scales, as far as its space planes have been put; those made for the whole box have that. */
 export class FeatureAreas {
-  /** Positions along x, y, z in [0, 1] between which features may be other than 0: 6 numbers for each scale. */
-  readonly bounds: Float32Array;
+  readonly #bounds: Float32Array;
+  /** Scales whose planes have changed since their bounds were found. */
+  readonly #changed = new Set<number>();
   /** Whether a texel [row][column] is other than 0 in a channel, of the scales that may be parts. */
   readonly #used: (Record<SpacePlane, Uint8Array> | null)[];
   readonly #layout: Layout;
@@ -25,7 +26,7 @@ export class FeatureAreas {
       });
       return isPart ? Object.fromEntries(used) : null;
     });
-    this.bounds = Float32Array.from(this.#used.flatMap((used) => (used === null ? WHOLE : EMPTY)));
+    this.#bounds = Float32Array.from(this.#used.flatMap((used) => (used === null ? WHOLE : EMPTY)));
   }
 
   /** Take note of rows of a space plane. */
@@ -44,7 +45,17 @@ export class FeatureAreas {
         }
       }
     }
-    this.bounds.set(this.#area(scale, used), 6 * scale);
+    this.#changed.add(scale);
+  }
+
+  /** Positions along x, y, z in [0, 1] between which features may be other than 0: 6 numbers for each scale. */
+  get bounds(): Float32Array {
+    for (const scale of this.#changed) {
+      const used = this.#used[scale];
+      if (used !== null) this.#bounds.set(this.#area(scale, used), 6 * scale);
+    }
+    this.#changed.clear();
+    return this.#bounds;
   }
 
   /** Return between which positions the product of a scale's space planes may be other than 0. */
