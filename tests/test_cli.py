@@ -13,6 +13,7 @@ import pytest
 
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, UsageError
+from kpc.format.container import rewriting
 from kpc.tools.cli import kpinfo
 
 
@@ -71,6 +72,39 @@ def test_errors_name_the_file_that_was_asked_for_not_the_one_written_aside(tmp_p
     with pytest.raises(FileNotFoundError) as caught, cli.atomic_write(tmp_path / "a.png") as aside:
         aside.unlink()
     assert caught.value.filename == str(tmp_path / "a.png")
+
+
+def test_the_target_of_a_symbolic_link_is_written_and_keeps_its_permissions(tmp_path: Path) -> None:
+    store, link, dangling = tmp_path / "store", tmp_path / "scene.kpc", tmp_path / "next.kpc"
+    store.mkdir()
+    (store / "blob").write_bytes(b"old")
+    (store / "blob").chmod(0o640)
+    link.symlink_to("store/blob")
+    dangling.symlink_to("store/new")
+    for path, target in (link, store / "blob"), (dangling, store / "new"):
+        cli.check_writable(path)
+        with cli.atomic_write(path) as aside:
+            assert aside.parent == store and aside.suffix == ".kpc"
+            aside.write_bytes(b"whole")
+        assert path.is_symlink() and target.read_bytes() == b"whole"
+    assert (store / "blob").stat().st_mode & 0o777 == 0o640
+    (tmp_path / "lost.kpc").symlink_to("nowhere/lost")
+    with pytest.raises(UsageError, match="nowhere: no such folder"):
+        cli.check_writable(tmp_path / "lost.kpc")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_pipes_and_devices_are_no_outputs(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.kpc")
+    (tmp_path / "null.kpc").symlink_to(os.devnull)
+    (tmp_path / "loop.kpc").symlink_to("loop.kpc")
+    for name, what in ("pipe", "is a named pipe; KPC"), ("null", "is a device; KPC"), ("loop", "symbolic links"):
+        path = tmp_path / f"{name}.kpc"
+        for write in cli.check_writable, lambda path: rewriting.save(b"whole", path):
+            with pytest.raises(OSError, match=what) as caught:
+                write(path)
+            assert caught.value.filename == str(path)
+        assert path.is_fifo() or path.is_symlink()
 
 
 @pytest.mark.parametrize("letter", ["x", "é", "😀"])

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import re
+import stat
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -116,25 +117,23 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path in the folder of `path`, and rename it to `path` on success or delete it on failure.
 
     A reader of `path` therefore never sees a half-written file. The temporary file keeps the suffix, since writers of
-    images and videos choose the file format by it.
+    images and videos choose the file format by it. As when a file is opened for writing, the target of a symbolic link
+    is written and the link stays, and a file that is replaced passes its permissions on.
 
     Raises:
         OSError: the file cannot be written; the error names `path`.
     """
     target = Path(path)
-    if target.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
     temporary: Path | None = None
     try:
+        written, mode = file_written(target)
         beginning = target.stem[:60]  # so that a name may be as long as the system permits: four bytes for a letter
-        handle, name = tempfile.mkstemp(prefix=f".{beginning}.", suffix=target.suffix, dir=target.parent)
+        handle, name = tempfile.mkstemp(prefix=f".{beginning}.", suffix=target.suffix, dir=written.parent)
         os.close(handle)
         temporary = Path(name)
         yield temporary
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)  # mkstemp created it readable by its owner alone
-        os.replace(temporary, target)
+        temporary.chmod(mode)  # mkstemp created it readable by its owner alone
+        os.replace(temporary, written)
     except OSError as error:
         # Errors of writing name no file, all others the temporary one.
         is_of_target = temporary is None or error.filename == str(temporary)
@@ -144,6 +143,34 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)  # unless it has been renamed
+
+
+def file_written(path: Path) -> tuple[Path, int]:
+    """Return the file that is written under a name, and the permissions that it gets.
+
+    It is the file of that name, there or not, or the target of a symbolic link. Folders, pipes and devices, which a
+    file renamed to their name would replace, are refused.
+
+    Raises:
+        OSError: it is none of these, or a link leads nowhere; the error names `path`.
+    """
+    written = Path(os.path.realpath(path)) if path.is_symlink() else path
+    try:
+        mode = os.stat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):  # of which the writer complains
+        umask = os.umask(0)
+        os.umask(umask)
+        return written, 0o666 & ~umask
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, f"is a {_kind(mode)}; KPC writes files only, so give the name of one", str(path))
+    return written, stat.S_IMODE(mode)
+
+
+def _kind(mode: int) -> str:
+    """Return what a name that is neither that of a file nor of a folder stands for."""
+    return "named pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
 
 
 def check_writable(path: Path, *, is_folder: bool = False, option: str = "-o") -> None:
@@ -162,6 +189,7 @@ def check_writable(path: Path, *, is_folder: bool = False, option: str = "-o") -
     if not is_folder:
         if above.is_dir():
             raise UsageError(f"{path}: is a folder; give the name of a file")
+        above = file_written(path)[0].absolute()
         if above.exists() and not os.access(above, os.W_OK):  # renaming would replace it all the same
             raise OSError(errno.EACCES, f"is write-protected; choose another name with {option}", str(path))
         above = above.parent

@@ -214,6 +214,13 @@ def test_an_address_follows_content_options_and_group(take: Path) -> None:
     assert not {*before} & {*keys(("--seed=1", "--quality=40"))}
 
 
+def test_a_result_that_is_a_link_is_written_where_it_leads(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "take.json").symlink_to("../master.json")
+    Store(str(tmp_path / "out")).put_text("{}", "take.json")
+    assert (tmp_path / "out" / "take.json").is_symlink() and (tmp_path / "master.json").read_text() == "{}"
+
+
 @pytest.mark.parametrize("address", ["{}", "file://{}", "memory://{}", "s3"])
 def test_a_store_holds_whole_files(tmp_path: Path, address: str, request: pytest.FixtureRequest) -> None:
     place = request.getfixturevalue("bucket") if address == "s3" else address.format(tmp_path / "store")

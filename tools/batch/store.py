@@ -16,6 +16,7 @@ from typing import Any
 
 import fsspec
 
+from kpc.format.common import cli
 from kpc.format.common.errors import KpcError
 
 RESULT, LOG, SCENE, WORK = "result.json", "log.txt", "scene.kpc", "work"
@@ -43,6 +44,7 @@ class Store:
         self.address = address
         try:
             self._fs, self._root = fsspec.core.url_to_fs(address)
+            self._is_local = "file" in self._fs.protocol
             self._fs.makedirs(self._root, exist_ok=True)
         except Exception as error:
             raise StoreError(f"{address}: {reason(error)}") from error
@@ -124,6 +126,9 @@ class Store:
     def _written(self, name: str) -> Iterator[str]:
         """Yield a path to write to; it is renamed to `name` on success, and removed otherwise."""
         target = self._path(name)
+        if self._is_local:
+            with self._errors(name):
+                target = str(cli.file_written(Path(target))[0])
         folder, _, last = target.rpartition("/")
         temporary = f"{folder}/.{uuid.uuid4().hex}.{last}"
         try:
@@ -138,7 +143,7 @@ class Store:
             raise
 
     def _rename(self, temporary: str, target: str) -> None:
-        if "file" in self._fs.protocol:
+        if self._is_local:
             shutil.move(temporary, target)  # os.replace; fsspec's own would copy
         else:
             self._fs.mv(temporary, target)
