@@ -4,6 +4,7 @@
 
 import sys
 
+from kpc.format.common.text import notice
 from kpc.format.common.version import VERSION
 
 
@@ -19,6 +20,6 @@ def main(argv: list[str] | None = None) -> int:
         if error.name not in ("torch", "av", "numba"):
             raise
         remedy = 'in a checkout of KPC, pip install ".[encoder]"'
-        print(f"kpenc: needs {error.name}, which is not installed; {remedy}", file=sys.stderr)
+        notice(f"kpenc: needs {error.name}, which is not installed; {remedy}")
         return 1
     return kpenc.main(argv)

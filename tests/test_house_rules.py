@@ -6,6 +6,7 @@
   "one function", and one with many parameters why its "parameters" are so many.
 * A docstring is a sentence; it does not begin with "Of".
 * Constants and attributes are documented by comments, not by string literals.
+* What users' commands say on stderr goes through `notice`, which escapes what names of files may hold.
 * The repository contains no symbolic links, since a clone on Windows turns them into text files.
 """
 
@@ -130,6 +131,18 @@ def test_constants_are_documented_by_comments() -> None:
             if isinstance(statement.value.value, str)
         ]
     assert not literals
+
+
+def test_messages_are_escaped() -> None:
+    apart = ("tests/", "spec/", ".ci/", "tools/bench/", "tools/dev/", "tools/vectors/", "encoder/training/")
+    found = [
+        f"{name}:{node.lineno}"
+        for name, node in nodes(ast.Call)
+        if not name.startswith(apart) and isinstance(node, ast.Call) and ast.unparse(node.func) == "print"
+        if any(ast.unparse(keyword.value) == "sys.stderr" for keyword in node.keywords)
+        and any(isinstance(part, ast.JoinedStr) for part in node.args)
+    ]
+    assert not found, f"print these by kpc.format.common.text.notice: {found}"
 
 
 def test_there_are_no_symbolic_links() -> None:

@@ -134,7 +134,7 @@ def _align(trainer: Trainer) -> list[Correction]:
         return []
     trainer.align_held_out()
     corrections = trainer.cameras.corrections()
-    log(describe_corrections(corrections, 1 / trainer.dataset.clip.fps))
+    log(*describe_corrections(corrections, 1 / trainer.dataset.clip.fps).split("\n"))
     return corrections
 
 
@@ -178,7 +178,7 @@ def _code(trainer: Trainer, scene: Scene, options: Options) -> CodedModel:
         Model(scene, validation, shown=True, effort=effort), options.trade, trainer.config.prune_share, tune_steps
     )
     if coded.pruned is not None:
-        log(describe_pruning(scene, coded.pruned, coded.spare_db))
+        log(*describe_pruning(scene, coded.pruned, coded.spare_db).split("\n"))
     return coded
 
 

@@ -20,6 +20,7 @@ from kpc.encoder.poses.page import NAME, write_page
 from kpc.encoder.poses.wishes import add_pose_options, wishes_from
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import escaped
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -37,8 +38,8 @@ def _command(argv: list[str]) -> None:
     page = file.with_name(NAME)
     write_page(found, f"Cameras of {options.folder.resolve().name}", page)
     print(report(found))
-    print(f"{page}: where the cameras stand, and what they see")
-    print(f"{file}: {len(found.structure.views)} of {len(found.view_names)} placed")
+    print(escaped(f"{page}: where the cameras stand, and what they see"))
+    print(escaped(f"{file}: {len(found.structure.views)} of {len(found.view_names)} placed"))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -86,7 +87,7 @@ def report(found: Found) -> str:
         view = found.structure.views.get(number)
         rows.append(
             (
-                name,
+                escaped(name),
                 f"{clock.offset_s:+.4f}",
                 f"{clock.rate:.5f}",
                 clock.method,

@@ -147,7 +147,7 @@ def prepare_trainer(options: Options, setting: Setting) -> Trainer:
     if options.layers == "auto" and (moving := _find_moving_area(config, dataset, aabb, mapping)) is not None:
         config = replace(config, moving_area=moving.box)
     trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s, mapping=mapping, moving=moving)
-    log(describe_model(trainer))
+    log(*describe_model(trainer).split("\n"))
     if resumes:
         trainer.resume(checkpoint)
     elif setting.before is not None:

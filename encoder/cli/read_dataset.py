@@ -14,6 +14,7 @@ from kpc.encoder.datasets.loading import has_layout, layouts_of
 from kpc.encoder.poses.footage import find_footage
 from kpc.format.common.errors import UsageError
 from kpc.format.common.media_files import is_hidden, is_image, is_video
+from kpc.format.common.text import notice
 
 # The file beside found cameras that says what they were found from.
 ASKED = "asked.json"
@@ -37,7 +38,7 @@ def read_dataset(options: Options) -> Dataset:
         file = options.work_dir / POSES / "transforms.json"
         changed = _what_changed(options, file)
         if changed is None:
-            print(f"cameras: those found before, {file}", file=sys.stderr)
+            notice(f"cameras: those found before, {file}")
         else:
             _find_poses(options, file, changed)
         is_own = (file.parent / "images").is_dir()  # the frames of a moving camera lie beside the document
@@ -110,7 +111,7 @@ def _find_poses(options: Options, file: Path, why: str) -> None:
     from kpc.encoder.poses.find import find_poses
     from kpc.encoder.poses.page import write_page
 
-    print(f"{options.source}: {why}; finding the cameras", file=sys.stderr)
+    notice(f"{options.source}: {why}; finding the cameras")
     found = find_poses(options.source, options.wishes)
     shutil.rmtree(file.parent, ignore_errors=True)
     file.parent.mkdir(parents=True)

@@ -1,6 +1,5 @@
 """What kpenc prints: log lines on stderr while it runs, and the results on stdout."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -19,6 +18,7 @@ from kpc.encoder.training.temporal_resolution import TimeResolution
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.cli import print_json
 from kpc.format.common.progress import Progress
+from kpc.format.common.text import escaped, notice
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import FAR, Contraction, DeviceCoordinates
 
@@ -40,9 +40,10 @@ REFINED = {
 TABLE_ROWS = 40
 
 
-def log(text: str) -> None:
-    """Print a line on stderr."""
-    print(text, file=sys.stderr, flush=True)
+def log(*lines: str) -> None:
+    """Print lines on stderr, at once."""
+    for line in lines:
+        notice(line)
 
 
 def show_progress(progress: Progress, report: Report) -> None:
@@ -120,7 +121,7 @@ def describe_corrections(corrections: Sequence[Correction], frame_s: float) -> s
         sizes = np.abs(numbers)
         numbers, names = np.stack([np.median(sizes, axis=0), sizes.max(0)]), ["median", "largest"]
     else:
-        names = [c.camera for c in corrections]
+        names = [escaped(c.camera) for c in corrections]
     heads = ("turned", "moved", "focal", "clock", "red", "green", "blue")
     units = ("degrees", "% of rig", "%", "ms", "%", "%", "%")
     shown = [k for k in range(len(heads)) if k < 3 or numbers[:, k].any()]
@@ -136,10 +137,10 @@ def print_result(result: dict[str, Any], options: Options, as_json: bool) -> Non
     if as_json:
         print_json(result)
     elif result.get("is_copy"):
-        print(f"{options.output}: {describe_copy(result)}")
+        print(escaped(f"{options.output}: {describe_copy(result)}"))
     elif options.source.is_file():
         rate = f"{result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}"
-        print(f"{options.output}: {rate}; {describe_outcome(result)}")
+        print(escaped(f"{options.output}: {rate}; {describe_outcome(result)}"))
     else:
         _print_encode(result, options)
 
@@ -155,7 +156,7 @@ def _print_encode(result: dict[str, Any], options: Options) -> None:
             quality += ", right halves, each in an appearance fitted to its left half"
         if result["refine"] != "none":
             quality += ", their cameras aligned with the scene"
-    print(f"{options.output}: {quality} (rendered from the decoded file)")
+    print(escaped(f"{options.output}: {quality} (rendered from the decoded file)"))
     print(
         f"{result['size_bytes']:,} bytes, {result['bits_per_parameter']:.2f} bits per parameter of "
         f"{result['parameters']:,}; coding loss {result['coding_loss_db']:.3f} dB" + (" on held-out views" * tested)

@@ -1,6 +1,5 @@
 """Coding a finished checkpoint or a .kpc file anew, without pictures and without training."""
 
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,6 +13,7 @@ from kpc.encoder.rdo import codec_model
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import notice
 from kpc.format.common.version import VERSION
 from kpc.format.container import groups, rewriting, scene_io
 from kpc.format.container.container import MAGIC
@@ -94,7 +94,7 @@ def _transcode_groups(options: Options, source: groups.Groups) -> dict[str, Any]
         reader = source.open(number)
         metadata = _with_history(reader.metadata(), options)
         scene = replace(scene_io.read(reader), cameras=reader.cameras() or source.cameras(), metadata=metadata)
-        print(f"group {number} of {len(spans)}", file=sys.stderr, flush=True)
+        notice(f"group {number} of {len(spans)}")
         model = replace(codec_model.model_from_file(scene), shown=True)
         coded = codec_model.code(model, trade, TrainConfig().prune_share, _tune_steps(options))
         is_copy = is_copy and coded.scene is model.coded

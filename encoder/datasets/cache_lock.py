@@ -1,11 +1,12 @@
 """One process builds a cache while others wait for it."""
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from filelock import FileLock, Timeout
+
+from kpc.format.common.text import notice
 
 
 @contextmanager
@@ -19,7 +20,7 @@ def exclusive(path: Path) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        print(f"{path.parent}: another process decodes the same pictures; waiting for it", file=sys.stderr, flush=True)
+        notice(f"{path.parent}: another process decodes the same pictures; waiting for it")
         lock.acquire()
     try:
         yield

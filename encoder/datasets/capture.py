@@ -4,7 +4,6 @@ import errno
 import math
 import os
 import re
-import sys
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from kpc.encoder.datasets.video import VideoInfo, video_info
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
 from kpc.format.common.media_files import IMAGE_SUFFIXES, is_video
+from kpc.format.common.text import notice
 from kpc.format.scene.camera_checks import NO_DISTORTION, Distortion, check_depths, check_lens, check_pose
 
 # Where neither the dataset nor the user names test images, every eighth is one, as in LLFF (arXiv:1905.00889).
@@ -371,10 +371,7 @@ def report_missing(file: Path, folder: Path, missing: list[str], total: int) -> 
             f"{file}: none of its {total} images exists ({printable(missing[0])} ...); copy them to {folder}"
         )
     if missing:
-        print(
-            f"{file}: {len(missing)} of {total} frames have no image and are skipped: {first_names(missing)}",
-            file=sys.stderr,
-        )
+        notice(f"{file}: {len(missing)} of {total} frames have no image and are skipped: {first_names(missing)}")
 
 
 def report_orientations(root: Path, views: Iterable[CapturedView]) -> None:
@@ -382,16 +379,14 @@ def report_orientations(root: Path, views: Iterable[CapturedView]) -> None:
     turned = [view.file.name for view in views if view.orientation != 1 and view.upright]
     stored = [view.file.name for view in views if view.orientation != 1 and not view.upright]
     if turned:
-        print(
+        notice(
             f"{root}: {len(turned)} images are turned by their EXIF orientation, since the calibration is for that "
-            f"size: {first_names(turned)}",
-            file=sys.stderr,
+            f"size: {first_names(turned)}"
         )
     if stored:
-        print(
+        notice(
             f"{root}: {len(stored)} images have an EXIF orientation, but are used as stored, since the calibration "
-            f"does not ask for another size; if it is for turned images, turn the files: {first_names(stored)}",
-            file=sys.stderr,
+            f"does not ask for another size; if it is for turned images, turn the files: {first_names(stored)}"
         )
 
 

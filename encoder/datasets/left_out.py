@@ -1,11 +1,11 @@
 """Which images and videos of a dataset's folder are not used, so that it can be said."""
 
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 
 from kpc.encoder.datasets.capture import Capture, first_names
 from kpc.format.common.media_files import is_hidden, is_image, is_video
+from kpc.format.common.text import notice
 
 
 def media_in(folder: Path, *, recursive: bool = False) -> list[Path]:
@@ -32,9 +32,8 @@ def count_left_out(root: Path, capture: Capture, masks: Iterable[Path]) -> int:
     left_out = {*capture.found, *capture.left_out} - used - set(masks)
     unnamed = sorted(file.relative_to(root).as_posix() for file in left_out - set(capture.left_out))
     if unnamed:
-        print(
+        notice(
             f"{root}: {len(unnamed)} of {len(used | left_out)} files found belong to no camera and are left out: "
-            f"{first_names(unnamed)}",
-            file=sys.stderr,
+            f"{first_names(unnamed)}"
         )
     return len(left_out)

@@ -3,7 +3,6 @@
 import hashlib
 import math
 import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +32,7 @@ from kpc.encoder.datasets.masks import find_masks, load_masks
 from kpc.encoder.datasets.timeline import align
 from kpc.encoder.datasets.video import VideoInfo
 from kpc.format.common.errors import DatasetError, MediaError
-from kpc.format.common.text import one_line, valid_unicode
+from kpc.format.common.text import notice, one_line, valid_unicode
 from kpc.format.scene.camera_checks import NUMBER_LIMIT
 from kpc.format.scene.scene import Clip
 
@@ -115,7 +114,7 @@ def _recognise(root: Path, holdout: str | None) -> Capture:
     capture = layouts[0].read(root, holdout)
     if len(layouts) > 1:
         others = ", ".join(layout.NAME for layout in layouts[1:])
-        print(f"{root}: read as {capture.layout}; what is there in the layout of {others} is not", file=sys.stderr)
+        notice(f"{root}: read as {capture.layout}; what is there in the layout of {others} is not")
     return capture
 
 
@@ -171,10 +170,7 @@ def _fitting_downscale(root: Path, views: Sequence[CapturedView], most_across: i
     """Return the least factor that makes no picture longer than `most_across` pixels; print it."""
     longest = max(max(view.width, view.height) for view in views)
     factor = -(-longest // most_across)
-    print(
-        f"{root}: {longest} pixels across: --downscale {factor} (auto: {most_across} at most for the preset)",
-        file=sys.stderr,
-    )
+    notice(f"{root}: {longest} pixels across: --downscale {factor} (auto: {most_across} at most for the preset)")
     return factor
 
 
@@ -268,7 +264,7 @@ def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray,
     times = np.array(given, np.float64)
     low, high = times.min(), times.max()
     if low < 0 or high > 1:
-        print(f"{root}: times run from {low:g} to {high:g}; scaled to [0, 1]", file=sys.stderr)
+        notice(f"{root}: times run from {low:g} to {high:g}; scaled to [0, 1]")
         times = (times - low) / (high - low) if high > low else np.zeros_like(times)
     steps = np.diff(np.unique(np.round(times[[not view.is_test for view in capture.views]], 6)))
     count = min(1 + round(1 / float(np.median(steps))), len(times)) if len(steps) else 1
@@ -294,14 +290,13 @@ def _report_notes(root: Path, videos: dict[str, VideoInfo]) -> None:
     """Print one line for each thing that a user should know about how videos are read."""
     for note in dict.fromkeys(note for video in videos.values() for note in video.notes):
         names = [name for name, video in videos.items() if note in video.notes]
-        print(f"{root}: {first_names(names)}: {note}", file=sys.stderr)
+        notice(f"{root}: {first_names(names)}: {note}")
     timecodes = {video.timecode: name for name, video in videos.items() if video.timecode}
     if len(timecodes) > 1:
         shown = [f"{name} at {timecode}" for timecode, name in sorted(timecodes.items())]
-        print(
+        notice(
             f"{root}: videos begin at different timecodes ({first_names(shown)}), but are aligned by their times of "
-            "presentation; if the timecodes are right, cut the videos to begin at the same one",
-            file=sys.stderr,
+            "presentation; if the timecodes are right, cut the videos to begin at the same one"
         )
 
 

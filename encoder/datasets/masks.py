@@ -5,7 +5,6 @@ another image format; black (0) means ignored, as does transparent.
 """
 
 import copy
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprin
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info, read_mask
 from kpc.format.common.progress import Progress
+from kpc.format.common.text import notice
 
 # The folder of masks within a dataset.
 FOLDER = "masks"
@@ -112,10 +112,9 @@ def find_masks(root: Path, views: Sequence[CapturedView]) -> list[MaskFile | Non
         return masks  # their folder has been read as alpha
     if unmasked and (any(masks) or folder.is_dir()):
         total = sum(not view.video for view in views)
-        print(
+        notice(
             f"{folder if folder.is_dir() else root}: {len(unmasked)} of {total} images have no mask and are used "
-            f"entirely: {first_names(unmasked)}",
-            file=sys.stderr,
+            f"entirely: {first_names(unmasked)}"
         )
     return masks
 

@@ -5,7 +5,6 @@ same time, whatever their numbers. Each picture keeps its own time; frames of a 
 that rate has them, since time stamps are rounded.
 """
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from kpc.encoder.datasets.capture import printable
 from kpc.encoder.datasets.video import VideoInfo
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import notice
 from kpc.format.scene.scene import Clip
 
 # Frame rates of cameras and files, frames per second.
@@ -81,7 +81,7 @@ def align(root: Path, videos: Mapping[str, VideoInfo]) -> Timeline:
         list(map(printable, names)), rates, starts * fps, positions, [len(t) for t in seconds], frames, fps
     )
     if line:
-        print(f"{root}: {line}", file=sys.stderr)
+        notice(f"{root}: {line}")
     times = tuple(p / max(last, 1e-9) for p in positions)
     return Timeline(Clip(round(float(last)) + 1, fps), tuple(frames), times, float(start))
 

@@ -1,7 +1,6 @@
 """From bare footage to cameras and clocks: what `kpposes` does, and `kpenc` for a folder without poses."""
 
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from kpc.encoder.poses.wishes import Wishes
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info, read_image
 from kpc.format.common.progress import progress
+from kpc.format.common.text import notice
 
 # Attempts at a still rig: features in each picture, and instants at which what moves is matched.
 ATTEMPTS = ((4096, 4), (8192, 10))
@@ -70,19 +70,19 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
     footage = find_footage(root)
     images = [one.files[0] for one in footage if frame_count(one) == 1]
     if len(images) == len(footage) and wishes.rig == "moving":
-        print(f"{root}: taken for the frames of a camera that moves (as --rig says)", file=sys.stderr)
+        notice(f"{root}: taken for the frames of a camera that moves (as --rig says)")
         found = _find_moving_camera(
             root, Footage(root.name, tuple(file for one in footage for file in one.files), None)
         )
     elif all(frame_count(one) == 1 for one in footage):
         frames = "; --rig moving for the frames of a clip" if _is_numbered(footage) else ""
-        print(f"{root}: taken for photographs of one scene ({len(footage)} images{frames})", file=sys.stderr)
+        notice(f"{root}: taken for photographs of one scene ({len(footage)} images{frames})")
         found = _find_photographs(root, footage)
     else:
         surveys = [survey(one) for one in progress(footage, "looking at what moves", unit="camera")]
         moving = [one.name for one, seen in zip(footage, surveys, strict=True) if not seen.is_still]
         is_still = not moving if wishes.rig == "auto" else wishes.rig == "still"
-        print(f"{root}: {_what(footage, surveys, is_still, wishes.rig)}", file=sys.stderr)
+        notice(f"{root}: {_what(footage, surveys, is_still, wishes.rig)}")
         if is_still:
             found = _find_still_rig(root, footage, surveys, wishes)
         elif len(footage) == 1:
@@ -94,7 +94,7 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
             )
     _check(root, found, wishes.require_all)
     for doubt in doubts(found.kind, found.view_names, found.structure):
-        print(f"{root}: warning: {doubt}", file=sys.stderr)
+        notice(f"{root}: warning: {doubt}")
     return _scaled(root, found, wishes)
 
 
@@ -137,10 +137,7 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
             best = structure
         if len(best.views) == len(footage):
             break
-        print(
-            f"{root}: {len(best.views)} of {len(footage)} cameras placed; trying again with more features",
-            file=sys.stderr,
-        )
+        notice(f"{root}: {len(best.views)} of {len(footage)} cameras placed; trying again with more features")
     assert best is not None
     if still is not None and len(still.views) > len(best.views):
         best = still
@@ -153,10 +150,9 @@ def _warn_of_clocks(root: Path, names: Sequence[str], clocks: Sequence[Clock]) -
     advice = "film a clap that all cameras see and hear, or give their offsets with --sync offsets.json"
     unknown = [name for name, clock in zip(names, clocks, strict=True) if clock.method == "none"]
     if unknown and len(unknown) < len(names):
-        print(
+        notice(
             f"{root}: warning: the clocks of {first_names(unknown)} could not be found and are left as they are; "
-            f"{advice}",
-            file=sys.stderr,
+            f"{advice}"
         )
     unsure = [
         f"{name} ({clock.confidence:.0%})"
@@ -164,7 +160,7 @@ def _warn_of_clocks(root: Path, names: Sequence[str], clocks: Sequence[Clock]) -
         if clock.method == "motion" and clock.confidence < SURE
     ]
     if unsure:
-        print(f"{root}: warning: the clocks of {first_names(unsure)} are unsure; {advice}", file=sys.stderr)
+        notice(f"{root}: warning: the clocks of {first_names(unsure)} are unsure; {advice}")
 
 
 def _find_moving_camera(root: Path, footage: Footage) -> Found:
@@ -214,7 +210,7 @@ def _check(root: Path, found: Found, require_all: bool) -> None:
         raise DatasetError(f"{root}: {placed}, too few: {first_names(said)}; {advice}")
     if require_all:
         raise DatasetError(f"{root}: {placed}; left out: {first_names(said)}; {advice}, or drop --require-all")
-    print(f"{root}: {placed}; left out: {first_names(said)}", file=sys.stderr)
+    notice(f"{root}: {placed}; left out: {first_names(said)}")
 
 
 def _neighbours(structure: Structure, number: int) -> list[int]:

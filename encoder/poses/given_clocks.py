@@ -8,7 +8,6 @@ Time of the clip = offset_s + rate * time of the camera's file. Cameras that are
 """
 
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from kpc.encoder.datasets.layouts.documents import MAX_BYTES, read_json
 from kpc.encoder.datasets.layouts.transforms import GREATEST_RATE, LONGEST_OFFSET_S
 from kpc.encoder.poses.clocks import UNKNOWN, Clock
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import notice
 
 KEYS = ("offset_s", "rate")
 
@@ -40,7 +40,7 @@ def read_clocks(file: Path, names: Sequence[str]) -> list[Clock]:
         )
     missing = [name for name in names if name not in document]
     if missing:
-        print(f"{file}: does not name {first_names(missing)}, whose clocks are left as they are", file=sys.stderr)
+        notice(f"{file}: does not name {first_names(missing)}, whose clocks are left as they are")
     return [_clock(file, name, document[name]) if name in document else UNKNOWN for name in names]
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from kpc.format.common import interrupts
 from kpc.format.common.errors import KpcError, UsageError
-from kpc.format.common.text import one_line, valid_unicode
+from kpc.format.common.text import escaped, notice, valid_unicode
 from kpc.format.common.version import VERSION
 
 # Packages that only some extras bring, with one that does.
@@ -79,7 +79,7 @@ def message_of(error: KpcError | OSError) -> str | None:
         return str(error)
     if error.filename is None and error.errno not in NO_ROOM:
         return None
-    where = f"{error.filename}: " if error.filename is not None else ""
+    where = f"{escaped(str(error.filename))}: " if error.filename is not None else ""
     return f"{where}{error.strerror or error}"
 
 
@@ -103,8 +103,7 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 def print_error(name: str, message: str) -> None:
     """Print an error of a command as one line on stderr; control codes, which a terminal would obey, as escapes."""
-    line = re.sub(r"[\x00-\x1f\x7f-\x9f]", lambda code: one_line(code[0]), " ".join(message.split()))
-    print(f"{name}: {line}", file=sys.stderr)
+    notice(f"{name}: {' '.join(message.split())}")
 
 
 def _fail(name: str, message: str, code: int) -> int:

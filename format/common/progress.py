@@ -10,6 +10,7 @@ from typing import Any, Self, TypeVar
 from tqdm import tqdm
 
 from kpc.format.common.compiling import working_s
+from kpc.format.common.text import escaped
 
 T = TypeVar("T")
 
@@ -42,7 +43,7 @@ class Progress:
     """
 
     def __init__(self, label: str, total: float | None = None, unit: str = "", *, shown: bool = True) -> None:
-        self.label, self.total, self.unit, self.shown = label, total, unit, shown
+        self.label, self.total, self.unit, self.shown = escaped(label), total, unit, shown
         self.done, self.text = 0.0, ""
         self.reported_at, self.line_after_s = time.monotonic(), FIRST_LINE_S
         # Units done and the time at the first call of `advance`. The remaining time is estimated from there on, since
@@ -52,7 +53,9 @@ class Progress:
         if shown and sys.stderr.isatty():
             count = "" if unit == "%" else " {n:.0f}/{total:.0f}"  # the bar begins with the percentage
             layout = f"{{l_bar}}{{bar}}|{count} [{{elapsed}}<{{left}}]{{postfix}}" if total else None
-            self.bar = _Bar(total=total, desc=label, unit=unit or "it", leave=False, file=sys.stderr, bar_format=layout)
+            self.bar = _Bar(
+                total=total, desc=self.label, unit=unit or "it", leave=False, file=sys.stderr, bar_format=layout
+            )
 
     def advance(self, count: float = 1) -> None:
         """Record that `count` more units are done."""

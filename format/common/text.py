@@ -7,6 +7,7 @@ surrogates (PEP 383): with them a file is found, but they can be neither printed
 import codecs
 import os
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO
@@ -77,6 +78,18 @@ def first_names(names: Sequence[str], command: str = "kpinfo --json") -> str:
 def option_name(field: str) -> str:
     """Return the option of a command that sets a field of its options, whose name ends with its unit."""
     return "--" + field.removesuffix("_s").removesuffix("_db").replace("_", "-")
+
+
+def escaped(text: str | os.PathLike[str]) -> str:
+    """Return text with escapes for what breaks a line or controls a terminal: line breaks, control codes, and marks
+    that turn the direction of writing. Names of files may hold all of them.
+    """
+    return re.sub("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]", lambda code: one_line(code[0]), os.fspath(text))
+
+
+def notice(text: str) -> None:
+    """Print one line on stderr, `escaped`."""
+    print(escaped(text), file=sys.stderr, flush=True)
 
 
 def one_line(text: str) -> str:

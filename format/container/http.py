@@ -13,7 +13,6 @@ urllib3 does what lies below: connection reuse, TLS, proxies and time-outs.
 import contextlib
 import copy
 import random
-import sys
 import threading
 import time as clock
 from collections.abc import Callable
@@ -23,6 +22,7 @@ import urllib3
 
 from kpc.format.common.errors import BudgetError, InterruptedRead, NetworkError, UnreachableError
 from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.common.text import notice
 from kpc.format.container.http_address import printable
 from kpc.format.container.http_client import HttpClient, TemporaryFailure, describe_failure
 from kpc.format.container.http_headers import length_of, range_of, retry_after, validator_of
@@ -60,7 +60,7 @@ TEMPORARY_STATUS = {408, 425, 429, 500, 502, 503, 504}
 def report_on_stderr(message: str | None) -> None:
     """Print the state of a connection for the user of a command; None means that it works again."""
     if message is not None:
-        print(message, file=sys.stderr, flush=True)
+        notice(message)
 
 
 @dataclass

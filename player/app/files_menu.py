@@ -1,6 +1,6 @@
 """The menu of files: the system's dialog, the playlist, and the files that were opened lately."""
 
-from kpc.format.common.text import valid_unicode
+from kpc.format.common.text import escaped, valid_unicode
 from kpc.format.container.http_address import is_url, public_name
 from kpc.player.app.actions import Actions
 from kpc.player.app.desktop import imgui
@@ -38,4 +38,4 @@ def _entry(actions: Actions, file: str, name: str, identifier: str, is_present: 
     label = name.replace("##", "# #")  # ImGui shows no more than what is before "##"
     if imgui.menu_item(f"{label}##{identifier}", "", is_present)[0] and not is_present:
         actions.open(file)
-    tip(valid_unicode(public_name(file) if is_url(file) else file))
+    tip(escaped(valid_unicode(public_name(file) if is_url(file) else file)))

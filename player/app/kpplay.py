@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 from kpc.format.common import cli
 from kpc.format.common.errors import ContextLostError, KpcError, UsageError
 from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.common.text import notice
 from kpc.format.container.sources import RemoteSource, open_source
 from kpc.format.scene.rig import Rig
 from kpc.player.app import preferences
@@ -76,7 +77,7 @@ def _command(argv: list[str]) -> None:
         try:
             preferences.save(last_settings, file)
         except OSError as error:
-            print(f"kpplay: settings were not saved: {file}: {error.strerror or error}", file=sys.stderr)
+            notice(f"kpplay: settings were not saved: {file}: {error.strerror or error}")
     if failures:
         raise KpcError(f"loading stopped: {'; '.join(failures)}")
 
@@ -188,7 +189,7 @@ def _play(
             if before is not None:
                 player.state.play_like(before)
             if stream.notice is not None and interrupted is None:
-                print(f"kpplay: {stream.notice}", file=sys.stderr)
+                notice(f"kpplay: {stream.notice}")
                 player.state.notify_error(stream.notice)  # for long enough to outlast a slow first picture
             if path is not None:
                 player.state.follower.replace(path)
@@ -206,7 +207,7 @@ def _play(
                     failures.append(stream.failure)
                 settings = player.preferences()
                 if (report := player.close()) is not None:
-                    print(f"kpplay: {report}", file=sys.stderr)
+                    notice(f"kpplay: {report}")
             if interrupted is not None:
                 window.close()
                 stream.close()

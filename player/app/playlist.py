@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePath
 
 from kpc.format.common.errors import UsageError
-from kpc.format.common.text import valid_unicode
+from kpc.format.common.text import escaped, valid_unicode
 from kpc.format.container.http_address import is_url, public_name
 
 # Files that are remembered as opened lately.
@@ -85,7 +85,7 @@ def menu_names(files: Sequence[str]) -> list[str]:
     # By the paths, since a file may be there twice.
     alike = {path.name for path in paths if any(one.name == path.name and one != path for one in paths)}
     names = [f"{path.parent.name}/{path.name}" if path.name in alike else path.name for path in paths]
-    return [_shortened(valid_unicode(name)) for name in names]
+    return [_shortened(escaped(valid_unicode(name))) for name in names]
 
 
 def _shortened(name: str) -> str:

@@ -9,6 +9,7 @@ from enum import Enum, auto
 import numpy as np
 
 from kpc.format.common.errors import KpcError
+from kpc.format.common.text import escaped
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
 from kpc.player.app.controls import AppearanceSelection, OrbitView, Playback
@@ -219,11 +220,11 @@ class PlayerState:
 
     def notify(self, text: str) -> None:
         """Show a message."""
-        self.notice = Notice(text, clock.monotonic() + NOTICE_S)
+        self.notice = Notice(escaped(text), clock.monotonic() + NOTICE_S)
 
     def notify_error(self, text: str) -> None:
         """Show an error message, for longer."""
-        self.notice = Notice(text, clock.monotonic() + ERROR_NOTICE_S, is_error=True)
+        self.notice = Notice(escaped(text), clock.monotonic() + ERROR_NOTICE_S, is_error=True)
 
     @contextlib.contextmanager
     def reporting_errors(self, subject: object) -> Iterator[None]:

@@ -7,7 +7,7 @@ from typing import Any
 import moderngl
 
 from kpc.format.common.errors import ContextLostError, DisplayError
-from kpc.format.common.text import valid_unicode
+from kpc.format.common.text import escaped, valid_unicode
 from kpc.player.app.desktop import glfw, imgui
 from kpc.player.app.keyboard import KeyPress, key_name
 
@@ -173,7 +173,7 @@ class Window:
 
     def set_title(self, title: str) -> None:
         """Change the title."""
-        glfw.set_window_title(self.handle, valid_unicode(title))
+        glfw.set_window_title(self.handle, escaped(valid_unicode(title)))
 
     def check(self) -> None:
         """Raise a ContextLostError if the graphics card was reset, which loses everything on it."""

@@ -1,6 +1,5 @@
 """Playing scenes in the browser of this machine."""
 
-import sys
 import tempfile
 import threading
 import webbrowser
@@ -13,6 +12,7 @@ from urllib.parse import urlsplit
 from kpc.format.common.cli import message_of
 from kpc.format.common.errors import KpcError, UsageError
 from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.common.text import notice
 from kpc.format.container.groups import Groups
 from kpc.format.container.http_address import is_url
 from kpc.player.sharing import site
@@ -81,11 +81,11 @@ def _opened(files: Sequence[str], budget: int) -> list[tuple[str, Groups]]:
         except (KpcError, OSError) as error:
             if not found and number + 1 == len(files):
                 raise
-            print(f"kpplay: {message_of(error) or error}; left out", file=sys.stderr)
+            notice(f"kpplay: {message_of(error) or error}; left out")
             continue
         found.append((file, groups))
         if groups.reader.cut_off is not None:
-            print(f"kpplay: {groups.reader.cut_off}; what is there is played", file=sys.stderr)
+            notice(f"kpplay: {groups.reader.cut_off}; what is there is played")
     return found
 
 

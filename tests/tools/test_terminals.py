@@ -1,18 +1,22 @@
 """Commands print names that are not UTF-8 on terminals that are not UTF-8, with replaced letters."""
 
+import errno
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from kpc.encoder.coding.scene_writer import write
 from kpc.format.coding.quantise import quantise_scene
+from kpc.format.common import cli
 from kpc.format.common.images import write_image
-from kpc.tools.cli import contactsheet, kpinfo, kpjoin
+from kpc.tools.cli import contactsheet, kpedit, kpexport, kpinfo, kpjoin, kprender
 from scenes import tiny_scene
 
 
@@ -60,3 +64,26 @@ def test_a_locale_that_is_not_utf8(folder: bytes) -> None:
     done = subprocess.run(command, env=environment, capture_output=True, check=False)
     assert done.returncode == 1 and done.stdout == b""
     assert done.stderr.startswith(b"kpinfo: ") and b"caf?" in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="such names are no names on Windows")
+def test_line_breaks_and_control_codes_of_names_are_escaped(
+    tmp_path: Path, scene_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "a\n\x1b[31mb.kpc"
+    shutil.copy(scene_file, source)
+    edited, joined, film = (tmp_path / f"{name}\n\x1b[31m.kpc" for name in ("edited", "joined", "film"))
+    assert kpedit.main([str(source), "-o", str(edited), "--title", "t"]) == 0
+    assert kpjoin.main([str(source), str(source), "-o", str(joined)]) == 0
+    picture = ["--time", "0", "--size", "8x6", "--backend", "reference"]
+    assert kprender.main([str(source), *picture, "-o", str(film.with_suffix(".png"))]) == 0
+    assert kpexport.main([str(source), "-o", str(film.with_suffix(".usda"))]) == 0
+    printed, said = capsys.readouterr()
+    assert "\x1b" not in printed + said
+    assert [line.partition(":")[0] for line in printed.splitlines()] == [
+        str(tmp_path / f"{name}\\n\\x1b[31m{suffix}")
+        for name, suffix in (("edited", ".kpc"), ("joined", ".kpc"), ("film", ".png"), ("film", ".usda"))
+    ]
+    assert (
+        cli.message_of(FileNotFoundError(errno.ENOENT, "none", str(source))) == f"{tmp_path}/a\\n\\x1b[31mb.kpc: none"
+    )

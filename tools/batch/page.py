@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from kpc.format.common.text import escaped, notice
 from kpc.tools.batch.engine import Event
 
 # Seconds between two pictures of the page.
@@ -38,7 +39,7 @@ class Page:
             if time.monotonic() - self._shown_at > REFRESH_S:
                 self.redraw()
         elif event.kind != "waits" and (before is None or before.kind != event.kind):
-            print(_line_of(event), file=sys.stderr, flush=True)
+            notice(_line_of(event))
 
     def redraw(self) -> None:
         """Show the present state of the page."""
@@ -89,7 +90,7 @@ def _line_of(event: Event) -> str:
         parts.append(f"{event.outcome.seconds:.0f} s" if event.outcome.worker else "done before")
     elif event.outcome is not None:
         parts.append(event.outcome.error.splitlines()[-1] if event.outcome.error else "")
-    return ", ".join(part for part in parts if part)
+    return escaped(", ".join(part for part in parts if part))
 
 
 def describe(figures: dict[str, object]) -> list[str]:

@@ -17,6 +17,7 @@ from kpc.format.common.errors import MediaError, UsageError
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.images import read_image, write_image
 from kpc.format.common.media_files import is_image
+from kpc.format.common.text import escaped, notice
 from kpc.tools.cli.depth_images import NO_SURFACE, read_depth_levels
 
 # Space between pictures, and height of a caption, in pixels.
@@ -171,11 +172,12 @@ def _command(argv: list[str]) -> None:
     found, alone = pairs(options.truth, options.rendered)
     if alone:
         others = f" and {len(alone) - 1} others" if len(alone) > 1 else ""
-        print(f"contactsheet: {alone[0]}{others}: no partner of that name, left out", file=sys.stderr)
+        notice(f"contactsheet: {alone[0]}{others}: no partner of that name, left out")
     quality = {pair.name: pair.psnr for pair in found}
     chosen = sorted({round(k) for k in np.linspace(0, len(found) - 1, min(options.rows, len(found)))})
     write_image(options.output, sheet([found[k] for k in chosen], quality))
-    print(f"{options.output}: mean PSNR {np.mean(list(quality.values())):.2f} dB over {len(found)} pictures")
+    mean = np.mean(list(quality.values()))
+    print(escaped(f"{options.output}: mean PSNR {mean:.2f} dB over {len(found)} pictures"))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
+from kpc.format.common.text import escaped, notice
 from kpc.tools.batch.jobs import Batch, FaultyBatch, Job, Resources, check_results, jobs_of_folders, read_jobs, resolve
 from kpc.tools.batch.store import Store
 from kpc.tools.batch.summary import SHARED, print_summary, publish, write_report
@@ -46,7 +47,7 @@ def _command(argv: list[str]) -> None:
     first, known = first_tasks(batch.jobs), done_before(store)
     if options.dry_run:
         for task in first:
-            print(f"{task.key} {'done' if task.key in known else 'to do':<5} {task.name}: {task.source}")
+            print(escaped(f"{task.key} {'done' if task.key in known else 'to do':<5} {task.name}: {task.source}"))
         return
     ended = _run(batch.jobs, shared, known, options)
     failed = publish(batch.jobs, ended, store, output)
@@ -80,7 +81,7 @@ def _run(
                 workers = options.workers or scheduling.local_workers(most)
                 client = stack.enter_context(scheduling.local_cluster(workers, most))
             if find_spec("bokeh") is not None:  # which draws it
-                print(f"Dask's dashboard: {client.dashboard_link}", file=sys.stderr)
+                notice(f"Dask's dashboard: {client.dashboard_link}")
             return client
 
         engine, page = scheduling.Engine(connect, Place(shared, options.scratch or "")), Page(options.json)

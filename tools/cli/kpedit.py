@@ -26,7 +26,7 @@ import numpy as np
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
-from kpc.format.common.text import counted
+from kpc.format.common.text import counted, escaped, notice
 from kpc.format.common.version import VERSION
 from kpc.format.container.clip_sound import has_sound
 from kpc.format.container.groups import Groups, load
@@ -55,20 +55,19 @@ def _command(argv: list[str]) -> None:
     if groups.clip.frame_count == 1 and (edits.speed is not None or edits.fps is not None):
         raise UsageError("--fps, --speed: the scene is static; it has no frames to show at another rate")
     if edits.speed is not None and has_sound(groups):
-        print("kpedit: the sound is left out, since it belongs to the speed of the source", file=sys.stderr)
+        notice("kpedit: the sound is left out, since it belongs to the speed of the source")
     metadata = _edited_metadata(groups.metadata(), options, edits.placement)
     if not edits.any:
         if metadata.document == groups.metadata().document:
-            print("kpedit: there is nothing to change; the output is a copy of the source", file=sys.stderr)
+            notice("kpedit: there is nothing to change; the output is a copy of the source")
         size, kept_s = save(with_metadata(options.scene, metadata), options.output), None
     else:
         size, kept_s = edit(options.scene, options.output, edits, metadata)
     if (kept_s is not None or options.box is not None) and size > options.scene.stat().st_size:
-        print(
-            "kpedit: larger than the source, since texels are predicted from less; kpenc makes it smaller, at a loss",
-            file=sys.stderr,
+        notice(
+            "kpedit: larger than the source, since texels are predicted from less; kpenc makes it smaller, at a loss"
         )
-    print(f"{options.output}: {size:,} bytes{_changed_time(options, kept_s)}")
+    print(escaped(f"{options.output}: {size:,} bytes{_changed_time(options, kept_s)}"))
 
 
 def _parser() -> argparse.ArgumentParser:

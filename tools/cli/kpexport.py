@@ -25,6 +25,7 @@ import kpc
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
 from kpc.format.common.progress import Progress
+from kpc.format.common.text import counted, escaped, notice
 from kpc.format.container.groups import GroupedScene, Groups
 from kpc.format.scene.cameras import Camera, View, save_views
 from kpc.format.scene.metadata import Metadata, camera_document
@@ -93,7 +94,7 @@ def _export_geometry(task: Task, options: argparse.Namespace) -> None:
             count += len(shape.points)
     what = "vertices" if options.mesh else "points"
     files = f"{len(shots)} file{'s' * (len(shots) != 1)}, " if task.is_folder else ""
-    print(f"{output}: {files}{count:,} {what}, in {clock.monotonic() - started:.1f} s")
+    print(escaped(f"{output}: {files}{count:,} {what}, in {clock.monotonic() - started:.1f} s"))
 
 
 def _say_where(placement: Placement, metadata: Metadata) -> None:
@@ -188,7 +189,7 @@ def _exchange_cameras(task: Task, options: argparse.Namespace) -> None:
     save_views(output, views)
     for note in notes:
         _say(note)
-    print(f"{output}: {len(views)} view{'s' * (len(views) != 1)}")
+    print(escaped(f"{output}: {counted(len(views), 'view')}"))
 
 
 def _write_cameras(task: Task, output: Path, tracks: list[Track], fps: float) -> None:
@@ -200,7 +201,7 @@ def _write_cameras(task: Task, output: Path, tracks: list[Track], fps: float) ->
             _say(note)
     count = sum(len(track.views) for track in tracks)
     what = f"a path of {count} instants" if tracks[0].is_moving else f"{count} camera{'s' * (count != 1)}"
-    print(f"{output}: {what}")
+    print(escaped(f"{output}: {what}"))
 
 
 def _usd() -> ModuleType:
@@ -220,7 +221,7 @@ def _needed(module: str, package: str) -> None:
 
 
 def _say(text: str) -> None:
-    print(f"kpexport: {text}", file=sys.stderr)
+    notice(f"kpexport: {text}")
 
 
 if __name__ == "__main__":

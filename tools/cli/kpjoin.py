@@ -15,6 +15,7 @@ from pathlib import Path
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import escaped, notice
 from kpc.format.container import groups
 from kpc.format.scene.metadata import camera_document, differences
 from kpc.tools.editing.clips import Edits, edit
@@ -58,10 +59,10 @@ def _command(argv: list[str]) -> None:
     clip = groups.Timeline(tuple(part.span for part in parts), parts[0].fps).clip
     duration = f"{clip.frame_count:,} frames at {clip.fps:g} fps, {clip.total_s:.2f} s"
     if differing := differences([part.metadata for part in parts]):
-        print(f"kpjoin: the files differ, so the clip has no {', '.join(differing)}", file=sys.stderr)
+        notice(f"kpjoin: the files differ, so the clip has no {', '.join(differing)}")
     if _cameras_differ(options.scenes):
-        print("kpjoin: the files have different cameras; those of the first stand for the clip", file=sys.stderr)
-    print(f"{options.output}: {size:,} bytes, {len(parts)} groups, {duration}")
+        notice("kpjoin: the files have different cameras; those of the first stand for the clip")
+    print(escaped(f"{options.output}: {size:,} bytes, {len(parts)} groups, {duration}"))
 
 
 def _cameras_differ(scenes: Sequence[Path]) -> bool:

@@ -29,7 +29,7 @@ from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.common.films import FilmFormat, write_film
 from kpc.format.common.progress import progress
-from kpc.format.common.text import counted
+from kpc.format.common.text import counted, escaped, notice
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Part, Rendering
 from kpc.tools.rendering import pictures, resuming
@@ -79,7 +79,7 @@ def _command(argv: list[str]) -> None:
             what = _write_film(output, film, shots, picture, scene, options, sound if sound.exists() else None)
     else:
         what = _write_pictures(output, shots, picture, scene, options, is_transparent)
-    print(f"{what}, in {clock.monotonic() - started:.1f} s")
+    print(escaped(f"{what}, in {clock.monotonic() - started:.1f} s"))
 
 
 def _film_format(output: Output, options: argparse.Namespace) -> FilmFormat | None:
@@ -200,7 +200,7 @@ def _write_pictures(
 
 
 def _say(text: str) -> None:
-    print(f"kprender: {text}", file=sys.stderr)
+    notice(f"kprender: {text}")
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.common.images import write_image
 from kpc.format.common.progress import progress
+from kpc.format.common.text import counted, escaped
 from kpc.player.app.playlist import Playlist
 from kpc.player.sharing import site
 from kpc.player.sharing.site import SharedScene
@@ -71,9 +72,8 @@ def _command(argv: list[str]) -> None:
         title = options.title or (options.gallery or folder).absolute().name
         site.write_file(folder / site.PAGE, site.with_record(site.gallery_page(scenes, title, options.url), player))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    print(
-        f"{folder / site.PAGE}: {len(files)} scene{'s' * (len(files) != 1)}, {size:,} bytes; put {folder} on a web host"
-    )
+    what = f"{counted(len(files), 'scene')}, {size:,} bytes"
+    print(escaped(f"{folder / site.PAGE}: {what}; put {folder} on a web host"))
     if not is_gallery:
         print("\nTo show it within another page:\n" + site.embed_snippet(scenes[names[0]], url=options.url))
 

@@ -11,9 +11,11 @@ import re
 import sys
 import threading
 from pathlib import Path
+from urllib.parse import quote
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import notice
 from kpc.player.sharing.file_server import Link, serving
 
 
@@ -44,8 +46,8 @@ def _command(argv: list[str]) -> None:
         raise UsageError(f"--port {options.port} is not a port number")
     with serving(options.folder, port=options.port, link=Link(options.rate, options.delay)) as url:
         for path in sorted(options.folder.glob("*.kpc")):
-            print(f"{url}/{path.name}", flush=True)
-        print(f"serve: {options.folder} at {url}; press Ctrl-C to stop", file=sys.stderr)
+            print(f"{url}/{quote(path.name)}", flush=True)
+        notice(f"serve: {options.folder} at {url}; press Ctrl-C to stop")
         threading.Event().wait()
 
 

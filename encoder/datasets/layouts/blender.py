@@ -3,7 +3,6 @@
 Sources: https://github.com/bmild/nerf, https://github.com/albertpumarola/D-NeRF
 """
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from kpc.encoder.datasets.layouts.transforms import (
     report_contradictions,
 )
 from kpc.encoder.datasets.left_out import media_in
+from kpc.format.common.text import notice
 
 # The layout's name in messages.
 NAME = "Blender"
@@ -42,7 +42,7 @@ def read(path: Path, holdout: str | None) -> Capture:
         document = load_transforms(file)
         if split == "val" and "test" in splits and holdout is None:
             left_out = _existing(path, file, document)
-            print(f"{file}: {len(left_out)} pictures are left out, since the test split is held out", file=sys.stderr)
+            notice(f"{file}: {len(left_out)} pictures are left out, since the test split is held out")
             continue
         images = find_images(path, file, document)
         report_contradictions(file, document, next(iter(images.values())))

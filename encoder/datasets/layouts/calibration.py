@@ -8,7 +8,6 @@ Source: https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html
 
 import math
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import Lens, first_names, opengl_pose, printable
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import notice
 from kpc.format.scene.camera_checks import NO_DISTORTION, NUMBER_LIMIT, Distortion
 from kpc.format.scene.rotations import rotation_of
 
@@ -56,7 +56,7 @@ def first_calibration(root: Path, files: Sequence[Path]) -> Path:
     """Return the first of a folder's calibrations, and name the others in one line."""
     chosen, *others = files
     if others:
-        print(f"{root}: {chosen.name} is read; {first_names([o.name for o in others])} are not", file=sys.stderr)
+        notice(f"{root}: {chosen.name} is read; {first_names([o.name for o in others])} are not")
     return chosen
 
 

@@ -6,7 +6,6 @@
 Source: `src/caliscope/cameras/camera_array.py` and docs/ in https://github.com/mprib/caliscope
 """
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from kpc.encoder.datasets.layouts.documents import read_toml
 from kpc.encoder.datasets.layouts.rig_media import read_rig
 from kpc.encoder.datasets.left_out import media_in
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import notice
 
 # The layout's name in messages.
 NAME = "Caliscope"
@@ -47,10 +47,10 @@ def read(path: Path, holdout: str | None) -> Capture:
     if not posed:
         raise DatasetError(f"{file}: no camera has a pose; calibrate the rig first")
     if left := [name for name in tables if name not in posed]:
-        print(f"{file}: cameras without a pose, or to be ignored, are left out: {first_names(left)}", file=sys.stderr)
+        notice(f"{file}: cameras without a pose, or to be ignored, are left out: {first_names(left)}")
     folder = _recording(path)
     if times := next((name for name in _TIMES if (path / folder / name).is_file()), None):
-        print(f"{path / folder / times}: not read; videos are aligned by their own time stamps", file=sys.stderr)
+        notice(f"{path / folder / times}: not read; videos are aligned by their own time stamps")
     cameras = [toml_camera(name, f"{file} camera {printable(name)}", keys) for name, keys in posed.items()]
     return read_rig(path, NAME, file, cameras, (folder, "videos", "images", "."), holdout)
 

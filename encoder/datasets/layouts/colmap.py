@@ -3,7 +3,6 @@
 Source: https://colmap.github.io/format.html
 """
 
-import sys
 from pathlib import Path
 
 from kpc.encoder.datasets.capture import (
@@ -21,6 +20,7 @@ from kpc.encoder.datasets.capture import (
 from kpc.encoder.datasets.layouts.colmap_model import ModelImage, count_images, read_cameras, read_images
 from kpc.encoder.datasets.left_out import media_in
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import notice
 
 # The layout's name in messages.
 NAME = "COLMAP"
@@ -72,7 +72,7 @@ def _largest(path: Path) -> tuple[Path, Path]:
     chosen = counts.index(max(counts))
     shown = [f"{images.relative_to(path).as_posix()} ({n})" for (_, images), n in zip(models, counts, strict=True)]
     largest = shown.pop(chosen)
-    print(f"{path}: of several models the largest is read, {largest}; left out: {first_names(shown)}", file=sys.stderr)
+    notice(f"{path}: of several models the largest is read, {largest}; left out: {first_names(shown)}")
     return models[chosen]
 
 

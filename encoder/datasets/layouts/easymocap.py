@@ -8,7 +8,6 @@ Sources: `easymocap/mytools/camera_utils.py` in https://github.com/zju3dv/EasyMo
 `easyvolcap/utils/easy_utils.py` and `docs/misc/custom_dataset.md` in https://github.com/zju3dv/EasyVolcap
 """
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from kpc.encoder.datasets.layouts.calibration import RigCamera, numbers, opencv_
 from kpc.encoder.datasets.layouts.documents import read_yaml
 from kpc.encoder.datasets.layouts.rig_media import read_rig
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import notice
 
 # The layout's name in messages.
 NAME = "EasyMocap"
@@ -48,7 +48,7 @@ def read(path: Path, holdout: str | None) -> Capture:
     """
     chosen, *others = _calibrations(path)
     if others:
-        print(f"{path}: {chosen / 'intri.yml'} is read; {others[0] / 'intri.yml'} is not", file=sys.stderr)
+        notice(f"{path}: {chosen / 'intri.yml'} is read; {others[0] / 'intri.yml'} is not")
     file = chosen / "intri.yml"
     return read_rig(path, NAME, file, _cameras(chosen), ("videos", "images", "."), holdout, FOREGROUNDS)
 
@@ -98,4 +98,4 @@ def _report_keys(folder: Path, names: list[str], intri: dict[str, Any], extri: d
         next((key.removesuffix(f"_{n}") for n in names if key.endswith(f"_{n}")), key) for key in others
     )
     if kinds:
-        print(f"{folder}: keys of intri.yml and extri.yml without effect: {first_names(list(kinds))}", file=sys.stderr)
+        notice(f"{folder}: keys of intri.yml and extri.yml without effect: {first_names(list(kinds))}")

@@ -11,7 +11,6 @@ https://github.com/KAIR-BAIR/dycheck
 """
 
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,7 @@ from kpc.encoder.datasets.layouts.documents import MAX_BYTES, read_json
 from kpc.encoder.datasets.layouts.transforms import frame_rate
 from kpc.encoder.datasets.left_out import media_in
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import notice
 from kpc.format.scene.camera_checks import number_of
 
 # The layout's name in messages.
@@ -80,7 +80,7 @@ def read(path: Path, holdout: str | None) -> Capture:
     times = _instants(path / "metadata.json", list(images))
     scene = _scene(path / "scene.json")
     if both := [name for name in images if name in val and name in train]:
-        print(f"{file}: {len(both)} ids are in both lists and held out: {first_names(both)}", file=sys.stderr)
+        notice(f"{file}: {len(both)} ids are in both lists and held out: {first_names(both)}")
     tests = holdout_flags(path, [f"{name}.png" for name in images], holdout, [name in val for name in images])
     views = tuple(
         _view(path / "camera" / f"{name}.json", image, scene, times.get(name), is_test)
@@ -111,7 +111,7 @@ def _ids(file: Path) -> tuple[set[str], set[str]]:
     if not train | val:
         raise DatasetError(f"{file}: train_ids and val_ids list nothing; copy it anew")
     if left := sorted(every - train - val, key=natural_key):
-        print(f"{file}: {len(left)} ids are in neither train_ids nor val_ids: {first_names(left)}", file=sys.stderr)
+        notice(f"{file}: {len(left)} ids are in neither train_ids nor val_ids: {first_names(left)}")
     return train, val
 
 
@@ -127,7 +127,7 @@ def _images(path: Path) -> Path:
     first, *others = (folders[n] for n in sorted(folders))
     if others:
         names = first_names([folder.name for folder in others])
-        print(f"{path / 'rgb'}: the images in {first.name} are read; smaller ones are in {names}", file=sys.stderr)
+        notice(f"{path / 'rgb'}: the images in {first.name} are read; smaller ones are in {names}")
     return first
 
 

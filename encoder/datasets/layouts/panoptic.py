@@ -6,7 +6,6 @@ cameras of one type are read: those of high definition if there are any.
 Source: README.md and `python/panutils.py` in https://github.com/CMU-Perceptual-Computing-Lab/panoptic-toolbox
 """
 
-import sys
 from pathlib import Path
 
 from kpc.encoder.datasets.capture import Capture, first_names, natural_key, printable
@@ -14,7 +13,7 @@ from kpc.encoder.datasets.layouts.calibration import RigCamera, first_calibratio
 from kpc.encoder.datasets.layouts.documents import MAX_BYTES, read_json
 from kpc.encoder.datasets.layouts.rig_media import read_rig
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.text import open_text
+from kpc.format.common.text import notice, open_text
 
 # The layout's name in messages.
 NAME = "Panoptic Studio"
@@ -50,7 +49,7 @@ def read(path: Path, holdout: str | None) -> Capture:
     kind = next((kind for kind in FOLDERS if kind in types), types[0])
     if len(types) > 1:
         rest = first_names([other for other in types if other != kind])
-        print(f"{file}: the cameras of type {printable(kind)} are read, not those of type {rest}", file=sys.stderr)
+        notice(f"{file}: the cameras of type {printable(kind)} are read, not those of type {rest}")
     cameras: list[RigCamera] = []
     for number, keys in enumerate(listed):
         where, name = f"{file} camera {number}", keys.get("name")

@@ -9,7 +9,6 @@ Sources: `Pose2Sim/Utilities/calib_qca_to_toml.py` in https://github.com/perfana
 `CMarkupDeserializer.cpp` in https://github.com/qualisys/qualisys_cpp_sdk
 """
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -21,6 +20,7 @@ from kpc.encoder.datasets.layouts.calibration import PIXEL_CENTRE, RigCamera, fi
 from kpc.encoder.datasets.layouts.documents import read_xml
 from kpc.encoder.datasets.layouts.rig_media import read_rig
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import notice
 
 # The layout's name in messages.
 NAME = "Qualisys"
@@ -54,7 +54,7 @@ def read(path: Path, holdout: str | None) -> Capture:
         name = element.get("serial", "")
         where = f"{file} camera {printable(name or str(number))}"
         if element.get("calibrated", "true").lower() == "false":
-            print(f"{where}: is not calibrated and left out", file=sys.stderr)
+            notice(f"{where}: is not calibrated and left out")
             continue
         if not name or name in [camera.name for camera in cameras]:
             raise DatasetError(f"{where}: has no serial number of its own; export the file anew")
@@ -63,10 +63,7 @@ def read(path: Path, holdout: str | None) -> Capture:
         cameras.append(_camera(name, where, element))
     if turned:
         names = first_names(turned)
-        print(
-            f"{file}: videos are taken to be as the sensor filmed them, not turned for viewing: {names}",
-            file=sys.stderr,
-        )
+        notice(f"{file}: videos are taken to be as the sensor filmed them, not turned for viewing: {names}")
     return read_rig(path, NAME, file, cameras, ("videos", "images", "."), holdout)
 
 

@@ -10,7 +10,6 @@ name of a file, a part that begins with `cam`, or one that is as long as a seria
 """
 
 import re
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,6 +32,7 @@ from kpc.encoder.datasets.layouts.calibration import RigCamera
 from kpc.encoder.datasets.left_out import media_in
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media_files import is_hidden, is_video
+from kpc.format.common.text import notice
 
 # What precedes the number of a camera in names of files.
 _PREFIX = re.compile(r"(camera|cam|port|view|hd|vga|kinect|video)[-_ ]*", re.IGNORECASE)
@@ -88,10 +88,9 @@ def read_rig(
     used = sorted((c for c in cameras if c.name in media), key=lambda c: natural_key(c.name))
     missing = [camera.name for camera in cameras if camera.name not in media]
     if missing:
-        print(
+        notice(
             f"{file}: {len(missing)} of {len(cameras)} cameras have no video or images and are left out: "
-            f"{first_names(missing)}",
-            file=sys.stderr,
+            f"{first_names(missing)}"
         )
     paths = [media[camera.name].path for camera in used]
     times = _times(root, [media[camera.name] for camera in used])
@@ -108,7 +107,7 @@ def read_rig(
     if masks is not None:
         without = [view.file.name for view in views if view.foreground is None]
         lack = f"; {len(without)} of {len(views)} pictures have none: {first_names(without)}" if without else ""
-        print(f"{masks}: masks of the foreground; what they leave out is transparent{lack}", file=sys.stderr)
+        notice(f"{masks}: masks of the foreground; what they leave out is transparent{lack}")
     return Capture(layout, tuple(views), None, tuple(found))
 
 
@@ -154,7 +153,7 @@ def _media(
         others += [path.name for path in dict.fromkeys(strange) if path != root]
         entries = list(chosen.values())
     if others:
-        print(f"{root}: {_described(is_film, folder)} are read; left out: {first_names(others)}", file=sys.stderr)
+        notice(f"{root}: {_described(is_film, folder)} are read; left out: {first_names(others)}")
     files = [image for entry in entries for image in (entry.images or (entry.path,))]
     return chosen, [*files, *(item for item in media_in(root / folder) if is_video(item) == is_film)]
 
@@ -241,10 +240,9 @@ def _times(root: Path, media: Sequence[Media]) -> list[list[float | None]]:
                 f"{root}: {printable(fewest)} has {min(counts)} images, {printable(most)} {max(counts)}, and their "
                 "names do not number the instants; name the images by their instants, such as 000000.jpg"
             )
-        print(
+        notice(
             f"{root}: the names of images do not number the instants, so that their order does: the first of each "
-            "camera, the second of each, and so on",
-            file=sys.stderr,
+            "camera, the second of each, and so on"
         )
         frames = [list(range(count)) for count in counts]
     numbers = [number for some in frames if some is not None for number in some]
@@ -280,10 +278,9 @@ def _report_centres(file: Path, views: Sequence[CapturedView]) -> None:
     for view in views:
         cx, cy = view.intrinsics[2] / view.width, view.intrinsics[3] / view.height
         if max(abs(cx - 0.5), abs(cy - 0.5)) > FAR_OFF:
-            print(
+            notice(
                 f"{file}: the principal point of {printable(view.camera or '')} lies at {cx:.0%} of the width and "
-                f"{cy:.0%} of the height of its pictures; if it was calibrated at another size, say so there",
-                file=sys.stderr,
+                f"{cy:.0%} of the height of its pictures; if it was calibrated at another size, say so there"
             )
             return
 

@@ -6,7 +6,6 @@ made by hand may be in natural order: cam1, cam2, cam10. Where the two differ, t
 """
 
 import os
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from kpc.encoder.datasets.capture import natural_key, printable
 from kpc.encoder.datasets.video import read_video
 from kpc.format.common.images import read_image
 from kpc.format.common.media_files import is_video
+from kpc.format.common.text import notice
 
 # Orders of names in which rows may have been written, by what they sort: the first is LLFF's own.
 ORDERS: dict[str, Callable[[str], Any]] = {
@@ -70,10 +70,9 @@ def in_row_order(table: Path, files: Sequence[Path], centres: np.ndarray, direct
     order, other = orders[why], orders[next(name for name in (default, *ranked) if name != why)]
     row = next(n for n, (file, another) in enumerate(zip(order, other, strict=True)) if file != another)
     reason = "" if why == default else ", by which neighbouring cameras see more alike"
-    print(
+    notice(
         f"{table}: rows belong to files in the {why}{reason}: row {row} to {printable(order[row].name)}, not to "
-        f"{printable(other[row].name)}; if not, rename the files so that their order is that of the rows",
-        file=sys.stderr,
+        f"{printable(other[row].name)}; if not, rename the files so that their order is that of the rows"
     )
     return order
 

@@ -4,7 +4,6 @@ The document describes a camera and lists frames, which may override it. `transf
 """
 
 import math
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from kpc.encoder.datasets.layouts.transforms_keys import check_keys
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
 from kpc.format.common.media_files import is_video
+from kpc.format.common.text import notice
 from kpc.format.scene.camera_checks import DISTORTION_KEYS, Distortion, check_depths, number_of, pose_of
 from kpc.format.scene.camera_models import FISHEYE_MODELS, understood_model
 
@@ -152,7 +152,7 @@ def report_contradictions(file: Path, document: dict[str, Any], image: Path) -> 
         focal = number_of(str(file), document, f"fl_{axis}", math.nan)
         for key, other in _focals_of_angles(str(file), document, axis, number_of(str(file), document, side, size)):
             if abs(other - focal) > SAME_FOCAL * focal:
-                print(f"{file}: fl_{axis} is {focal:g}, but {other:g} by {key}; fl_{axis} is used", file=sys.stderr)
+                notice(f"{file}: fl_{axis} is {focal:g}, but {other:g} by {key}; fl_{axis} is used")
 
 
 def frame_rate(file: Path, document: dict[str, Any]) -> float | None:

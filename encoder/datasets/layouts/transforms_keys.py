@@ -7,12 +7,12 @@ Sources: https://docs.nerf.studio/quickstart/data_conventions.html, and `nerf_lo
 https://github.com/NVlabs/instant-ngp
 """
 
-import sys
 from pathlib import Path
 from typing import Any
 
 from kpc.encoder.datasets.capture import first_names
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import notice
 from kpc.format.scene.camera_models import NO_PINHOLE_KEYS, check_unknown_keys
 
 # Keys that are read.
@@ -72,4 +72,4 @@ def check_keys(file: Path, document: dict[str, Any]) -> None:
     without["unknown"] = [key for key in present if key not in UNDERSTOOD]
     parts = [f"{first_names(names)} ({reason})" for reason, names in without.items() if names]
     if parts:
-        print(f"{file}: keys without effect: {'; '.join(parts)}", file=sys.stderr)
+        notice(f"{file}: keys without effect: {'; '.join(parts)}")
