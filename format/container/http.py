@@ -26,6 +26,7 @@ from kpc.format.common.text import notice
 from kpc.format.container.http_address import printable
 from kpc.format.container.http_client import HttpClient, TemporaryFailure, describe_failure
 from kpc.format.container.http_headers import length_of, range_of, retry_after, validator_of
+from kpc.format.container.sources import BEGINNING_BYTES
 
 # Requested on opening: enough for header and index of 1600 chunks, or for the first coarse picture of a short clip.
 FIRST_BYTES = 1 << 16
@@ -35,10 +36,6 @@ PIECE_BYTES = 1 << 16
 
 # Bytes of a long response that are kept behind the current position.
 KEPT_BYTES = 1 << 26
-
-# Bytes of the beginning of a file by which it is recognised where its ETag or date differs, as between the nodes of a
-# server. They hold the header of a .kpc file and so the checksum of its index, which holds those of all chunks.
-BEGINNING_BYTES = 512
 
 # The most bytes before the ones requested that a response may begin with.
 MAX_SKIPPED_BYTES = 1 << 22

@@ -13,6 +13,12 @@ from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.http_address import Address, is_url, lacks_scheme
 
 
+# Bytes of the beginning of a file by which it is recognised: on a disk, and where its ETag or date differs, as between
+# the nodes of a server. They hold the header of a .kpc file and so the checksum of its index, which holds those of all
+# chunks.
+BEGINNING_BYTES = 512
+
+
 @runtime_checkable
 class Source(Protocol):
     """Random access to bytes.
@@ -116,6 +122,12 @@ def _identity(file: BinaryIO) -> tuple[int, int]:
     return status.st_dev, status.st_ino
 
 
+def _beginning(file: BinaryIO) -> bytes:
+    """Return what distinguishes a file from another that is written in its place."""
+    file.seek(0)
+    return file.read(BEGINNING_BYTES)
+
+
 class _FileSource:
     """A seekable file object; a file known by its path is opened anew for each read."""
 
@@ -129,16 +141,20 @@ class _FileSource:
                 raise OSError(errno.ESPIPE, "is a pipe, and scenes are read in any order; save it to a file", self.name)
             with open(self.name, "rb") as opened:  # so that an unreadable file is reported here, not later
                 self.size, self._identity = opened.seek(0, io.SEEK_END), _identity(opened)
+                self._beginning = _beginning(opened)
 
     def read_at(self, offset: int, length: int) -> bytes:
         if self.file is not None:
             self.file.seek(offset)
             return self.file.read(length)
         with open(self.name, "rb") as opened:
-            if _identity(opened) != self._identity or opened.seek(0, io.SEEK_END) < self.size:
-                raise FormatError(f"{self.name}: changed while it was read; open it again")
             opened.seek(offset)
-            return opened.read(length)
+            found = opened.read(length)
+            # afterwards, since a file that is written anew in place loses its beginning first
+            is_same = _identity(opened) == self._identity and opened.seek(0, io.SEEK_END) >= self.size
+            if not is_same or not _beginning(opened).startswith(self._beginning):
+                raise FormatError(f"{self.name}: changed while it was read; open it again")
+            return found
 
     def will_read(self, offset: int, length: int) -> None:
         """Do nothing: the operating system reads ahead."""

@@ -1,4 +1,5 @@
 import io
+import os
 import struct
 from dataclasses import replace
 
@@ -178,7 +179,7 @@ def test_sources_of_every_kind(tmp_path):
     assert str(path) in Reader(path).name
 
 
-@pytest.mark.parametrize("change", ["replaced", "shortened", "appended to"])
+@pytest.mark.parametrize("change", ["replaced", "shortened", "written anew", "appended to", "touched"])
 def test_a_file_that_changes_while_it_is_read_is_no_damaged_one(tmp_path, change):
     data, path, other = pack(CHUNKS, 7), tmp_path / "a.kpc", tmp_path / "b.kpc"
     path.write_bytes(data)
@@ -186,9 +187,13 @@ def test_a_file_that_changes_while_it_is_read_is_no_damaged_one(tmp_path, change
     other.write_bytes(data)
     if change == "replaced":
         other.replace(path)
+    elif change == "written anew":  # in place, by cp or rsync, and longer
+        path.write_bytes(pack([*CHUNKS[:-1], Chunk("test", NOISE[::-1] * 2)], 7))
+    elif change == "touched":
+        os.utime(path, (0, 0))
     else:
         path.write_bytes(data[:-1] if change == "shortened" else data + b"more")
-    if change == "appended to":  # a download goes on
+    if change in ("appended to", "touched"):  # as by a download that goes on
         assert reader.stored(0)
         return
     with pytest.raises(FormatError, match=r"a\.kpc: changed while it was read; open it again"):
