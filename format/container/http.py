@@ -23,10 +23,10 @@ import urllib3
 from kpc.format.common.errors import BudgetError, InterruptedRead, NetworkError, UnreachableError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.common.text import notice
+from kpc.format.container.beginning import BEGINNING_BYTES
 from kpc.format.container.http_address import printable
 from kpc.format.container.http_client import HttpClient, TemporaryFailure, describe_failure
 from kpc.format.container.http_headers import length_of, range_of, retry_after, validator_of
-from kpc.format.container.sources import BEGINNING_BYTES
 
 # Requested on opening: enough for header and index of 1600 chunks, or for the first coarse picture of a short clip.
 FIRST_BYTES = 1 << 16

@@ -10,13 +10,8 @@ from typing import BinaryIO, Protocol, runtime_checkable
 
 from kpc.format.common.errors import FormatError, NetworkError
 from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.container.beginning import BEGINNING_BYTES
 from kpc.format.container.http_address import Address, is_url, lacks_scheme
-
-
-# Bytes of the beginning of a file by which it is recognised: on a disk, and where its ETag or date differs, as between
-# the nodes of a server. They hold the header of a .kpc file and so the checksum of its index, which holds those of all
-# chunks.
-BEGINNING_BYTES = 512
 
 
 @runtime_checkable
