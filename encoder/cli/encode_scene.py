@@ -31,7 +31,7 @@ from kpc.encoder.evaluation.preview import Preview
 from kpc.encoder.evaluation.testing_time import affordable_pictures, picture_seconds
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field.occupancy_grid import merge_slots
-from kpc.encoder.rdo.codec_model import CodedModel, Model, code
+from kpc.encoder.rdo.codec_model import CodedModel, Model, check_size, code
 from kpc.encoder.rdo.model_checkpoint import save_checkpoint
 from kpc.encoder.rdo.sequential_finetune import steps_per_group
 from kpc.encoder.training.refinement import Correction
@@ -42,6 +42,7 @@ from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.common.progress import Progress
 from kpc.format.container import scene_io
 from kpc.format.container.rewriting import with_metadata
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Scene
 
 MAX_CAMERAS = 32  # cameras of the dataset that the file holds
@@ -58,6 +59,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     trainer = prepare_trainer(options, setting)
     if options.preview is not None:
         log(f"preview: {options.preview}, with the box, beside what was filmed")
+    _check_size(options, setting, trainer)
     checkpoint = options.work_dir / CHECKPOINT
     try:
         _train(trainer, checkpoint, options)
@@ -73,6 +75,20 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         if checkpoint.exists():
             log(f"stopped after training; {checkpoint} is kept, go on with --resume")
         raise
+
+
+def _check_size(options: Options, setting: Setting, trainer: Trainer) -> None:
+    """Refuse before training a target size that is less than what training and coding leave as it is.
+
+    How small the smallest file of a model is depends on its decoder, so it is known only once it is trained.
+
+    Raises:
+        TrainingError: it is.
+    """
+    if options.trade.target_bytes is not None:
+        cameras = tuple(trainer.dataset.camera(picture) for picture in _select_cameras(trainer.dataset))
+        scene = replace(trainer.scene(), cameras=cameras, sound=setting.sound, metadata=Metadata(dict(options.members)))
+        check_size(scene, reserve_figures(options).trade, is_coded=False)
 
 
 def _write(options: Options, setting: Setting, trainer: Trainer, started: float) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from kpc.encoder.cli.grouped import initialise_from
 from kpc.encoder.cli.options import Options
-from kpc.encoder.cli.read_dataset import PAGE, read_dataset
+from kpc.encoder.cli.read_dataset import PAGE, check_target_size, read_dataset
 from kpc.encoder.cli.report import REFINED, SPACES, describe_model, describe_time_rows, log, show_progress
 from kpc.encoder.cli.sound import find_sound
 from kpc.encoder.cli.transcode import check_outputs
@@ -91,7 +91,7 @@ def prepare_setting(options: Options) -> Setting:
     dataset = read_dataset(options)
     aabb, mapping, why = _find_space(dataset, options)
     sound, sound_from = find_sound(options, dataset)
-    options.trade.check_size(sound)
+    check_target_size(options, dataset.clip, sound)
     log(dataset.describe())
     log(f"pixels: {dataset.pixels.describe()}")
     for doubt in doubts(dataset):

@@ -3,11 +3,13 @@
 import json
 import shutil
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from kpc.encoder.cli.grouped import spans_of
+from kpc.encoder.cli.grouped import options_of_group, spans_of
 from kpc.encoder.cli.options import Options
+from kpc.encoder.cli.sound import check_sound, sound_of_span
 from kpc.encoder.cli.work_folder import POSES
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.datasets.loading import has_layout, layouts_of
@@ -15,6 +17,8 @@ from kpc.encoder.poses.footage import find_footage
 from kpc.format.common.errors import UsageError
 from kpc.format.common.media_files import is_hidden, is_image, is_video
 from kpc.format.common.text import notice
+from kpc.format.scene.scene import Clip
+from kpc.format.scene.sound import Sound
 
 # The file beside found cameras that says what they were found from.
 ASKED = "asked.json"
@@ -30,9 +34,10 @@ def read_dataset(options: Options) -> Dataset:
 
     Raises:
         DatasetError, MediaError: the dataset cannot be used, or its cameras cannot be found.
-        UsageError: options about cameras are given, and so are the cameras; or the clip has no such groups.
+        UsageError: options about cameras are given, and so are the cameras; or the clip has no such groups or sound.
+        TrainingError: the target size is too small for any scene.
     """
-    _refuse_unused(options)
+    _refuse_early(options)
     root, transforms = options.source, None
     if not has_layout(root) and _has_footage(root):
         file = options.work_dir / POSES / "transforms.json"
@@ -40,9 +45,16 @@ def read_dataset(options: Options) -> Dataset:
         if changed is None:
             notice(f"cameras: those found before, {file}")
         else:
+            if (footage := find_footage(root))[0].video is not None:
+                check_sound(options, {one.files[0].relative_to(root).as_posix(): one.files[0] for one in footage})
             _find_poses(options, file, changed)
         is_own = (file.parent / "images").is_dir()  # the frames of a moving camera lie beside the document
         root, transforms = (file.parent, None) if is_own else (root, file)
+
+    def check(clip: Clip, videos: Mapping[str, Path]) -> None:
+        check_target_size(options, clip)
+        check_sound(options, videos, is_dynamic=clip.frame_count > 1)
+
     return load_dataset(
         root,
         options.cache_dir,
@@ -50,7 +62,7 @@ def read_dataset(options: Options) -> Dataset:
         downscale=options.downscale or 1,
         most_across=options.most_across,
         transforms=transforms,
-        check_clip=lambda clip: spans_of(options, clip),
+        check_clip=check,
     )
 
 
@@ -59,15 +71,33 @@ def check_folder(options: Options) -> None:
 
     Raises:
         DatasetError: it has neither a layout nor footage.
-        UsageError: as for `read_dataset`.
+        UsageError, TrainingError: as for `read_dataset`.
     """
     if not _has_footage(options.source):
         layouts_of(options.source)
-    _refuse_unused(options)
+    _refuse_early(options)
 
 
-def _refuse_unused(options: Options) -> None:
-    """Refuse options about footage without poses, of which a folder with poses would use none."""
+def check_target_size(options: Options, clip: Clip, sound: Sound | None = None) -> None:
+    """Refuse a target size of which a group gets less than its header, index and sound take.
+
+    Raises:
+        UsageError: as for `spans_of`.
+        TrainingError: the size is too small.
+    """
+    spans = spans_of(options, clip)
+    if options.group_s is None:
+        options.trade.check_size(sound)
+        return
+    for number in range(len(spans)) if options.only is None else [options.only]:
+        options_of_group(options, number, spans).trade.check_size(sound_of_span(sound, spans[number], clip.fps))
+
+
+def _refuse_early(options: Options) -> None:
+    """Refuse options about footage without poses, of which a folder with poses would use none, and a target size that
+    is too small for any scene.
+    """
+    options.trade.check_size(None)
     if (given := options.wishes.options_given()) and has_layout(options.source):
         raise UsageError(f"{', '.join(given)}: {options.source} has poses, so none are looked for; drop what is unused")
 

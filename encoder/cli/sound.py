@@ -1,5 +1,6 @@
 """The sound of an encode: the clearest track of a dataset's videos, the one that is named, or that of a file."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +29,10 @@ def find_sound(options: Options, dataset: Dataset) -> tuple[Sound | None, str]:
     wanted = options.audio
     if wanted == "none" or (wanted == "auto" and dataset.video_start_s is None):
         return None, wanted
-    if not dataset.is_dynamic:
-        if wanted == "auto":
-            return None, wanted
-        raise UsageError(f"--audio {wanted}: the scene is static, so nothing can be heard; drop it")
     files = _videos(dataset)
+    check_sound(options, files, is_dynamic=dataset.is_dynamic)
+    if not dataset.is_dynamic:
+        return None, wanted
     if wanted == "auto":
         path, why = _clearest(dataset, files)
     else:
@@ -51,6 +51,28 @@ def find_sound(options: Options, dataset: Dataset) -> tuple[Sound | None, str]:
         f"second ({why})"
     )
     return sound, path.name
+
+
+def check_sound(options: Options, videos: Mapping[str, Path], *, is_dynamic: bool = True) -> None:
+    """Refuse a name of --audio that is neither that of a video nor of a sound file, before pictures are decoded.
+
+    Args:
+        options: of the encode.
+        videos: of the clip, by their names; none of images.
+        is_dynamic: whether anything is heard.
+
+    Raises:
+        UsageError: as for `find_sound`.
+    """
+    wanted = options.audio
+    if wanted in ("auto", "none"):
+        return
+    if not is_dynamic:
+        raise UsageError(f"--audio {wanted}: the scene is static, so nothing can be heard; drop it")
+    path = _named(wanted, videos)
+    if not has_sound(path):
+        what = f"{path} has no sound track" if path in videos.values() else "no sound file, nor a video with one"
+        raise UsageError(f"--audio {wanted}: {what}")
 
 
 def sound_of_span(sound: Sound | None, span: Span, fps: float) -> Sound | None:
@@ -90,14 +112,12 @@ def _clearest(dataset: Dataset, files: dict[str, Path]) -> tuple[Path | None, st
     return files[best], f"{among}{level}; --audio overrides"
 
 
-def _named(wanted: str, files: dict[str, Path]) -> Path:
+def _named(wanted: str, files: Mapping[str, Path]) -> Path:
     for name, path in files.items():
         if wanted in (name, path.name, path.stem):
             return path
     path = Path(wanted)
     if path.is_file():
-        if not has_sound(path):
-            raise UsageError(f"--audio {wanted}: no sound file, nor a video with a sound track")
         return path
     known = ", ".join(printable(path.stem) for path in list(files.values())[:4])
     cameras = f"one of {known}{' ...' if len(files) > 4 else ''}, or " if files else ""

@@ -3,7 +3,7 @@
 import hashlib
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -61,7 +61,7 @@ def load_dataset(
     most_across: int | None = None,
     progress: bool = True,
     transforms: Path | None = None,
-    check_clip: Callable[[Clip], object] = lambda _: None,
+    check_clip: Callable[[Clip, Mapping[str, Path]], object] = lambda *_: None,
 ) -> Dataset:
     """Read a dataset: recognise its layout by its content, decode its pictures and masks, and read its cameras.
 
@@ -77,7 +77,8 @@ def load_dataset(
         most_across: instead of `downscale`, the most pixels along the longer side of a picture.
         progress: whether to report progress on stderr.
         transforms: a document of `kpposes` for the folder, if it lies elsewhere.
-        check_clip: called before pictures are decoded; what it raises ends the reading.
+        check_clip: called with the clip and its videos by name before pictures are decoded; what it raises ends the
+            reading.
 
     Raises:
         DatasetError: the folder does not exist, has no known layout, is inconsistent, its masks leave nothing to train
@@ -181,11 +182,11 @@ def _load(
     cache_dir: Path,
     downscale: int,
     progress: bool,
-    check_clip: Callable[[Clip], object],
+    check_clip: Callable[[Clip, Mapping[str, Path]], object],
 ) -> Dataset:
     views = capture.views
     frames, times, clip, video_start_s = _times(root, capture)
-    check_clip(clip)
+    check_clip(clip, {view.file.relative_to(root).as_posix(): view.file for view in views if view.video})
     view_of = np.repeat(np.arange(len(views)), [len(some) for some in frames])  # the view of each picture
     used = [(some.start, some.stop) for some in frames]
     key = hashlib.sha256(os.fsencode(f"{root.resolve()} {downscale} {used}")).hexdigest()[:12]

@@ -1,5 +1,6 @@
 """The sound of an encode: which track is taken, which part of it, and that files and groups have it."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +12,10 @@ from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.sound import find_sound, sound_of_span
 from kpc.encoder.coding.opus import encode_sound
-from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.datasets import Dataset, load_dataset, loading
 from kpc.encoder.datasets.sound_tracks import clarity, read_samples
 from kpc.encoder.field.config import PRESETS
+from kpc.encoder.poses import find
 from kpc.encoder.rdo.model_checkpoint import read_checkpoint
 from kpc.format.common.errors import MediaError, UsageError
 from kpc.format.container.clip_sound import sample_at
@@ -76,11 +78,38 @@ def test_no_sound_takes_more_than_its_bitrate(channels: int, bitrate: int | None
 
 
 @pytest.mark.parametrize(
-    "audio, words", [("cam09", "neither a camera nor a file; give one of cam00, cam01"), ("cam00", "has no sound in")]
+    "audio, words",
+    [("cam09", "neither a camera nor a file; give one of cam00, cam01"), ("cam00", "cam00.mp4 has no sound track")],
 )
 def test_a_track_that_is_not_there_is_refused(audio, words, dataset):
     with pytest.raises(UsageError, match=words):
         find_sound(options(audio), dataset)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--audio", "cam09"], "--audio cam09: neither a camera nor a file"),
+        (["--audio", "cam00"], "has no sound track"),
+        (["--target-size", "200"], "index and sound alone take"),
+        (["--group", "1s", "--target-size", "2KB"], "index and sound alone take"),  # half of it for each group
+    ],
+)
+def test_what_no_clip_has_is_refused_before_pictures_are_decoded(folder, tmp_path, monkeypatch, capsys, words, said):
+    monkeypatch.setattr(loading, "cached_pixels", lambda *_: pytest.fail("pictures are decoded"))
+    monkeypatch.chdir(tmp_path)
+    assert kpenc.main([str(folder), "-o", "out.kpc", *words]) != 0
+    assert said in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_a_name_of_no_track_is_refused_before_cameras_are_looked_for(folder, tmp_path, monkeypatch, capsys):
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for video in folder.glob("*.mp4"):
+        shutil.copy(video, bare)
+    monkeypatch.setattr(find, "find_poses", lambda *_: pytest.fail("cameras are looked for"))
+    assert kpenc.main([str(bare), "-o", str(tmp_path / "out.kpc"), "--audio", "cam09"]) == 2
+    assert "--audio cam09: neither a camera nor a file; give one of cam00, cam01" in capsys.readouterr().err
 
 
 def test_silent_videos_make_no_sound(dataset, folder, tmp_path, capsys):

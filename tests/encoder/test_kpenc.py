@@ -777,6 +777,7 @@ def test_rate_distortion_targets(run: Kpenc, sets: Path, tmp_path: Path) -> None
     for size, reason in ("0.5KB", "what no quantisation step shrinks"), ("1KB", "is the smallest size of this model"):
         code, out, err = run(sets / "n3dv", "--resume", "--keep", "--target-size", size)
         assert code == 1 and out == "" and reason in err.splitlines()[-1]
+        assert ("occupied: " in err) == (size == "1KB")  # what is too small for cameras is refused before training
     assert (tmp_path / "out.kpc").read_bytes() == last
     assert run(sets / "n3dv", "--resume")[0] == 0 and {p.name for p in tmp_path.iterdir()} == {"out.kpc"}
 
