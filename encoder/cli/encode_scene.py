@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from kpc.encoder.cli.metadata import describe, hash_dataset, reserve_figures, with_figures
+from kpc.encoder.cli.metadata import describe, describe_origin, hash_dataset, reserve_figures, with_figures
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import Setting, prepare_trainer
 from kpc.encoder.cli.report import (
@@ -42,7 +42,6 @@ from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.common.progress import Progress
 from kpc.format.container import scene_io
 from kpc.format.container.rewriting import with_metadata
-from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Scene
 
 MAX_CAMERAS = 32  # cameras of the dataset that the file holds
@@ -86,8 +85,10 @@ def _check_size(options: Options, setting: Setting, trainer: Trainer) -> None:
         TrainingError: it is.
     """
     if options.trade.target_bytes is not None:
-        cameras = tuple(trainer.dataset.camera(picture) for picture in _select_cameras(trainer.dataset))
-        scene = replace(trainer.scene(), cameras=cameras, sound=setting.sound, metadata=Metadata(dict(options.members)))
+        dataset, pictures = trainer.dataset, _select_cameras(trainer.dataset)
+        metadata = describe_origin(options, dataset, pictures, "0" * 64)  # a checksum takes no less
+        cameras = tuple(map(dataset.camera, pictures))
+        scene = replace(trainer.scene(), cameras=cameras, sound=setting.sound, metadata=metadata)
         check_size(scene, reserve_figures(options).trade, is_coded=False)
 
 

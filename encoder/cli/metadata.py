@@ -28,12 +28,16 @@ FIGURES_BYTES = 200
 
 
 def describe(options: Options, dataset: Dataset, scene: Scene, cameras: list[int], dataset_sha256: str) -> Metadata:
-    """Return the metadata of a trained scene, without figures.
+    """Return the metadata of a trained scene with its cameras, without figures; arguments as for `describe_origin`."""
+    return with_view(describe_origin(options, dataset, cameras, dataset_sha256), scene, options.view_limits)
+
+
+def describe_origin(options: Options, dataset: Dataset, cameras: list[int], dataset_sha256: str) -> Metadata:
+    """Return the metadata of a scene that are known before it is trained.
 
     Args:
         options: of the run.
-        dataset: that it was trained on.
-        scene: with its cameras.
+        dataset: that it is trained on.
         cameras: pictures of the dataset that the cameras of the scene are of.
         dataset_sha256: of the whole dataset, `hash_dataset`.
     """
@@ -50,7 +54,7 @@ def describe(options: Options, dataset: Dataset, scene: Scene, cameras: list[int
         transparent=True if dataset.has_alpha else None,
         camera_names=[_printable(name) for name in names] or None,
     )
-    metadata = metadata.with_provenance(
+    return metadata.with_provenance(
         encoder=f"kpc {VERSION}",
         dataset_sha256=dataset_sha256,
         layout=dataset.layout,
@@ -58,7 +62,6 @@ def describe(options: Options, dataset: Dataset, scene: Scene, cameras: list[int
         seed=options.seed,
         options={**chosen, **options.wishes.changed(), name: value},
     )
-    return with_view(metadata, scene, options.view_limits)
 
 
 def with_view(metadata: Metadata, scene: Scene, wanted: str | Mapping[str, Any] | None) -> Metadata:
