@@ -19,6 +19,7 @@ from kpc.tools.exchange.field import box_points, densities, density_grid, plane_
 from kpc.tools.exchange.gltf import GltfReader
 from kpc.tools.exchange.options import DENSITY
 from kpc.tools.exchange.placement import rotation_to_y
+from kpc.tools.rendering.claims import claimed
 from scenes import VARIANTS, look_at, tiny_scene, with_contraction
 
 trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed, which reads what kpexport writes")
@@ -116,6 +117,13 @@ def test_points_lie_on_the_surface_in_its_colours(run: Run, ball_file: Path, tmp
     )
     outward = (body["p"] - CENTRE) / np.linalg.norm(body["p"] - CENTRE, axis=1, keepdims=True)
     assert (body["n"] * outward).sum(1).min() > 0.95
+
+
+def test_two_runs_do_not_mix_their_files_in_a_folder(run: Run, ball_file: Path, tmp_path: Path) -> None:
+    with claimed(tmp_path, "kpexport", {"input": "another.kpc"}):
+        code, _, said = run(ball_file, "--backend", "reference", "-o", tmp_path)
+        assert code == 2 and "another kpexport with other options is at work there" in said
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_mesh_is_closed_and_faces_outwards(run: Run, ball_file: Path, tmp_path: Path) -> None:

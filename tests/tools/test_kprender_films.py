@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -261,8 +262,30 @@ def test_resuming_knows_a_scene_by_its_content_and_keeps_no_secret(run: Run, sce
     (out / RECORD).unlink()
     code, _, printed = run(renamed, *SIZE, "--frames", "0-1", "--resume", "-o", out)
     assert code == 2 and "what they show is not known" in printed
-    described = resuming._described(argparse.Namespace(scene="https://user:password@host/a.kpc?token=secret"))
+    described = resuming.described(argparse.Namespace(scene="https://user:password@host/a.kpc?token=secret"))
     assert described["scene"].startswith("https://host/a.kpc, address of SHA-256 ") and len(described["scene"]) < 70
+
+
+def test_two_runs_share_a_folder_only_if_their_pictures_belong_together(
+    run: Run, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, write, found = tmp_path / "out", pictures.write_picture, []
+    out.mkdir()
+    (out / ".kprender-0123456789ab-killed.lock").touch()
+
+    def write_beside_others(*arguments: Any) -> None:
+        if not found:
+            found.append(None)
+            for words in ["--samples", 2], ["--samples", 2, "--frames", "0-0"], ["--frames", "1-1"]:
+                found.append(run(scene_file, *SIZE, *words, "-o", out))
+        write(*arguments)
+
+    monkeypatch.setattr(pictures, "write_picture", write_beside_others)
+    assert run(scene_file, *SIZE, "--frames", "0-0", "-o", out)[0] == 0
+    for code, _, said in found[1:3]:
+        assert code == 2 and "another kprender with other options is at work there" in said
+    assert found[3][0] == 0 and {path.name for path in out.iterdir()} == {"0000.png", "0001.png", RECORD}
+    assert run(scene_file, *SIZE, "--samples", 2, "--frames", "0-0", "-o", out)[0] == 0
 
 
 def test_resuming_tells_black_from_transparent(run: Run, scene_file: Path, tmp_path: Path) -> None:

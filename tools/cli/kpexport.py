@@ -12,6 +12,7 @@ metadata, if there are any.
 """
 
 import argparse
+import contextlib
 import sys
 import time as clock
 from collections.abc import Sequence
@@ -41,7 +42,9 @@ from kpc.tools.exchange.mesh import Mesh, surface_mesh
 from kpc.tools.exchange.options import DENSITY, PATH_FPS, RESOLUTION, SPACING_PARTS, USD_SUFFIXES, Task, parser, task_of
 from kpc.tools.exchange.placement import Placement
 from kpc.tools.exchange.points import MAX_CELLS, Cloud, is_clipped, normals_of, surface_points
+from kpc.tools.rendering.claims import claimed
 from kpc.tools.rendering.content import Render, renderer_of
+from kpc.tools.rendering.resuming import described
 from kpc.tools.rendering.shots import Shots, rate_note, shots_of
 
 
@@ -79,10 +82,12 @@ def _export_geometry(task: Task, options: argparse.Namespace) -> None:
         _say("the scene goes on beyond its box; only what lies in the box is exported")
     render = None if options.mesh else _renderer(loaded, options)
     output = Path(options.output)
-    if task.is_folder:
-        cli.make_folder(output)
     started, count = clock.monotonic(), 0
-    with Progress("export", len(shots), "files") as bar:  # advanced by parts of a file, which may take minutes
+    with contextlib.ExitStack() as alone:
+        if task.is_folder:
+            cli.make_folder(output)
+            alone.enter_context(claimed(output, "kpexport", described(options)))
+        bar = alone.enter_context(Progress("export", len(shots), "files"))  # advanced by parts, which may take minutes
         for number in shots.numbers:
             time = shots.time(number)
             if render is None:

@@ -15,6 +15,7 @@ The player saves files for --cameras and --path.
 """
 
 import argparse
+import contextlib
 import functools
 import sys
 import tempfile
@@ -182,18 +183,19 @@ def _write_pictures(
     paths, renamed = output.picture_paths([shots.name(number) for number in shots.numbers])
     if renamed:
         _say(f"{options.cameras}: {renamed} pictures get other names, for theirs are taken or no plain file names")
-    if output.is_folder:
-        cli.make_folder(output.path)
-        resuming.begin(output.path, options, is_transparent, paths)
     wanted = list(zip(shots.numbers, paths, strict=True))
-    if options.resume:
-        wanted = [
-            (number, path)
-            for number, path in wanted
-            if not pictures.is_complete(path, shots.camera(number), options.depth)
-        ]
-    for number, path in progress(wanted, "render", unit="pictures"):
-        pictures.write_picture(path, picture(number), is_transparent, unit)
+    with contextlib.ExitStack() as alone:
+        if output.is_folder:
+            cli.make_folder(output.path)
+            alone.enter_context(resuming.rendering(output.path, options, is_transparent, paths))
+        if options.resume:
+            wanted = [
+                (number, path)
+                for number, path in wanted
+                if not pictures.is_complete(path, shots.camera(number), options.depth)
+            ]
+        for number, path in progress(wanted, "render", unit="pictures"):
+            pictures.write_picture(path, picture(number), is_transparent, unit)
     there = f" ({len(shots) - len(wanted)} were there)" if len(wanted) < len(shots) else ""
     camera = shots.camera(shots.numbers[0])
     return f"{output.path}: {counted(len(shots), 'picture')}{there}, {camera.width}x{camera.height}"

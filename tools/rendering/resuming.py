@@ -1,9 +1,10 @@
 """What the pictures in a folder show, so that --resume does not mix pictures of different options."""
 
 import argparse
+import contextlib
 import hashlib
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import UsageError
 from kpc.format.container.http_address import Address, is_url
+from kpc.tools.rendering.claims import claimed
 
 RECORD = "kprender.json"
 # Options that do not change what a picture shows: they choose pictures, or concern other outputs. A picture of another
@@ -23,8 +25,11 @@ PICTURES = {".png", ".jpg", ".jpeg", ".exr"}
 NAMES = {"content": "what is shown", "part": "--diagnose", "scene": "the scene"}
 
 
-def begin(folder: Path, options: argparse.Namespace, is_transparent: bool, paths: Collection[Path]) -> None:
-    """Note in a folder what its pictures show, before the first one is rendered.
+@contextlib.contextmanager
+def rendering(
+    folder: Path, options: argparse.Namespace, is_transparent: bool, paths: Collection[Path]
+) -> Iterator[None]:
+    """Note in a folder what its pictures show, before the first one is rendered, and keep it from other pictures.
 
     Without `--resume`, pictures of other options that are to be replaced are deleted first, so that a later `--resume`
     does not take them for finished; where others stay, the folder is noted to hold pictures of various options.
@@ -37,11 +42,17 @@ def begin(folder: Path, options: argparse.Namespace, is_transparent: bool, paths
 
     Raises:
         UsageError: `--resume` is given, and pictures that are there were rendered with other options, or nobody knows
-            with which.
+            with which; or others are rendered there now.
     """
-    now = _described(options)
+    now = described(options)
     if is_transparent:
         now["background"] = "transparent"
+    with claimed(folder, "kprender", {name: _identity(value) for name, value in now.items()}):
+        _begin(folder, options, now, paths)
+        yield
+
+
+def _begin(folder: Path, options: argparse.Namespace, now: dict[str, Any], paths: Collection[Path]) -> None:
     record = folder / RECORD
     if record.is_file():
         try:
@@ -72,7 +83,7 @@ def begin(folder: Path, options: argparse.Namespace, is_transparent: bool, paths
         temporary.write_text(json.dumps(now, indent=1) + "\n")
 
 
-def _described(options: argparse.Namespace) -> dict[str, Any]:
+def described(options: argparse.Namespace) -> dict[str, Any]:
     """Return the options that pictures depend on, as JSON values without what is secret; files count by content."""
     found = {}
     for name, value in sorted(vars(options).items()):
