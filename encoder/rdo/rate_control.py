@@ -20,7 +20,7 @@ from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, mse_of_psn
 from kpc.encoder.field.occupancy_grid import merge_slots
 from kpc.encoder.rdo.curvature import PerPlane
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
-from kpc.encoder.rdo.rate_search import TOLERANCE, find_limit, find_tuned_limit, minimise
+from kpc.encoder.rdo.rate_search import COST_OCTAVES, TOLERANCE, find_limit, find_tuned_limit, minimise
 from kpc.format.coding.quantise import (
     HALF_BITS,
     QuantisedScene,
@@ -49,6 +49,7 @@ DEFAULT_LOSS_DB = 0.15  # PSNR that coding may cost where no target is given
 # predicted less well.
 TUNED_BYTES_TOLERANCE, TUNED_ERROR_TOLERANCE = 0.05, 0.1
 TUNED_ERROR, TUNED_BYTES = 0.7, 1.01  # error and bytes with fine-tuning, as a share of those without, about
+LEAST_TUNED_ERROR = 0.4  # less than fine-tuning was seen to leave of the error; 0.5 was
 SIGNIFICANCE_EXPONENT = 0.8  # of curvature in `significance`; 1 makes files 1 to 2 % larger
 # Share of the allowed error that fewer slots of the occupancy may take, and how many more cells, at most, a player then
 # has to march.
@@ -316,10 +317,15 @@ class RateController:
         own_steps = self.own_steps or self.source_file is not None
         finest, coarsest, guess = (0.0, RECODE_COARSEST, RECODE_GUESS) if own_steps else (FINEST, COARSEST, FIRST_GUESS)
         name, bound = trade.bound
+        if self._is_beyond(trade):
+            return self._attempt(0.0)
         if name == "lam":
             found = minimise(finest, coarsest, self._attempt, lambda one: one.cost(bound))
             if self.tune is None:
                 return found
+            least = found.cost(bound) - (1 - LEAST_TUNED_ERROR) * found.measured.mse
+            if self.source_file is not None and least >= self._attempt(0.0).cost(bound):
+                return self._attempt(0.0)  # without minutes of fine-tuning
             return min(found, self._tuned(found.exponent), key=lambda one: one.cost(bound))
         if name == "target_bytes" and self.source_file is not None:
             whole = self._attempt(0.0)
@@ -329,6 +335,20 @@ class RateController:
         if self.tune is None:
             return self._search(goal, guess, tolerance)
         return self._search_tuned(goal, guess, tolerance, name == "target_bytes")
+
+    def _is_beyond(self, trade: Trade) -> bool:
+        """Return whether any other coding than the source file errs too much, so that there is nothing to search for.
+
+        Numbers that are rounded once more, by other steps, err at once, and ever more with coarser steps. So the finest
+        other coding decides: its error, less what fine-tuning may take off it, against all that the target permits.
+        """
+        name, bound = trade.bound
+        if self.source_file is None or name == "target_bytes":
+            return False
+        error = self._attempt(COST_OCTAVES).measured.mse * (1 if self.tune is None else LEAST_TUNED_ERROR)
+        if name == "lam":
+            return error >= self._attempt(0.0).cost(bound)
+        return error > mse_of_loss(self.uncoded_psnr, trade.loss_db(self.uncoded_psnr))
 
     def _attempt(self, exponent: float) -> Attempt:
         if self.source_file is not None and exponent == 0:

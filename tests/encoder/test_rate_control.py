@@ -186,6 +186,26 @@ def test_a_file_is_never_coded_with_finer_steps() -> None:
     assert 0.7 * size < smaller.size_bytes <= 0.8 * size
 
 
+@pytest.mark.parametrize(
+    ("trade", "most_tried"), [({"lam": 1e-4}, 1), ({"quality": 100}, 1), ({"max_loss_db": 1e-9}, 1), ({"lam": 0.3}, 99)]
+)
+def test_a_file_that_nothing_betters_is_not_searched_for_long(trade: dict[str, float], most_tried: int) -> None:
+    whole = quantise_scene(SCENE, scaled(EQUAL, 0.01))
+    own = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in whole.scales]
+    tried: list[QuantisedScene] = []
+
+    def quantise(*words: Any) -> QuantisedScene:
+        tried.append(quantise_by_cost(*words))
+        return tried[-1]
+
+    psnr = measure(whole.dequantise()).psnr
+    judged = controller(
+        whole.dequantise(), own, ALIKE, measure, psnr, whole, quantise=quantise, tune=lambda *_: pytest.fail("tuned")
+    )
+    found = judged.meet(Trade(**trade))  # type: ignore[arg-type]
+    assert found.quantised is whole and len(tried) <= most_tried
+
+
 def test_a_size_that_sound_alone_takes_is_refused_at_once() -> None:
     sound = Sound(1, 312, 960, (bytes(5000),))
     Trade().check_size(sound)
