@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 
 from kpc.encoder.datasets.layouts.nerfstudio import MADE_BY
+from kpc.encoder.evaluation.camera_page import check_page
 from kpc.encoder.poses.document import write_document
 from kpc.encoder.poses.find import Found, find_poses
 from kpc.encoder.poses.page import NAME, write_page
@@ -33,9 +34,10 @@ def _command(argv: list[str]) -> None:
     file = options.output or options.folder / "transforms.json"
     cli.check_writable(file)
     _refuse_other_document(file)
+    page = file.with_name(NAME)
+    check_page(page)
     found = find_poses(options.folder, wishes_from(options))
     write_document(found, options.folder, file)
-    page = file.with_name(NAME)
     write_page(found, f"Cameras of {options.folder.resolve().name}", page)
     print(report(found))
     print(escaped(f"{page}: where the cameras stand, and what they see"))

@@ -4,6 +4,7 @@ import contextlib
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from kpc.encoder.cli.transcode import check_outputs
 from kpc.encoder.cli.work_folder import CHECKPOINT, POSES, choose_device, locked, make_work_folder
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.datasets.plausibility import doubts
-from kpc.encoder.evaluation.camera_page import write_page_of_dataset
+from kpc.encoder.evaluation.camera_page import check_page, write_page_of_dataset
 from kpc.encoder.evaluation.expectations import Expectations, expect
 from kpc.encoder.field.bounds import (
     find_box,
@@ -32,6 +33,7 @@ from kpc.encoder.training.moving_area import MovingArea, find_moving_area
 from kpc.encoder.training.temporal_resolution import fit_frames_per_row
 from kpc.encoder.training.tight_bounds import trim_box
 from kpc.encoder.training.train import Trainer, load_checkpoint_box
+from kpc.format.common import cli
 from kpc.format.common.errors import DatasetError, UsageError
 from kpc.format.common.progress import Progress
 from kpc.format.container import scene_layout
@@ -75,6 +77,8 @@ def working_alone(options: Options) -> Iterator[None]:
         UsageError, TrainingError, OSError: one cannot, or another kpenc is at work there.
     """
     check_outputs(options)
+    if options.preview is not None:
+        check_page(_camera_page(options))
     with locked(options.work_dir):
         yield
 
@@ -107,12 +111,17 @@ def prepare_setting(options: Options) -> Setting:
     return Setting(dataset, aabb, mapping, is_final, sound=sound, sound_from=sound_from)
 
 
+def _camera_page(options: Options) -> Path:
+    return options.output.with_name(options.output.name + ".cameras.html")
+
+
 def _show_cameras(options: Options, dataset: Dataset, expectations: Expectations) -> None:
     """Write the page of the cameras beside the output: that of found cameras, or one of those that were given."""
-    page = options.output.with_name(options.output.name + ".cameras.html")
+    page = _camera_page(options)
     found = options.work_dir / POSES / PAGE
     if found.exists():
-        shutil.copyfile(found, page)
+        with cli.atomic_write(page) as aside:
+            shutil.copyfile(found, aside)
     else:
         write_page_of_dataset(page, dataset, [dataset.describe(), f"Filmed: {expectations.paragraph()}"])
     log(f"cameras: {page}")

@@ -15,12 +15,16 @@ from PIL import Image
 
 from kpc.encoder.datasets.dataset import Dataset
 from kpc.encoder.poses.orientation import looked_at, up_direction
-from kpc.format.common.cli import atomic_write
+from kpc.format.common.cli import atomic_write, check_writable
+from kpc.format.common.errors import UsageError
 
 # At most so many cameras are labelled, have a picture, or are drawn; where there are more, some of them.
 LABELS, PICTURES, DRAWN, POINTS = 24, 24, 400, 2500
 # Sides of the drawings and widths of the pictures, in pixels; cameras are drawn by this share of a side.
 SIDE, WIDTH, CAMERA = 440, 200, 0.05
+
+# By this a page is known for one that may be replaced.
+GENERATOR = '<meta name="generator" content="kpc cameras">'
 
 STYLE = """
 :root{color-scheme:light dark;--ink:#1d2329;--faint:#68737d;--line:#d5dade;--page:#fff;--camera:#0b66c3;--point:#9aa4ad}
@@ -88,6 +92,18 @@ class Curve:
     motion: np.ndarray
 
 
+def check_page(file: Path) -> None:
+    """Refuse a name of a page under which another file lies: it stays.
+
+    Raises:
+        UsageError: one does that this module did not write.
+        OSError: it cannot be written.
+    """
+    check_writable(file)
+    if file.exists() and GENERATOR not in file.read_text(encoding="utf-8", errors="replace"):
+        raise UsageError(f"{file}: is no page of KPC and stays; move it, or write beside another -o")
+
+
 def write_camera_page(
     file: Path,
     title: str,
@@ -135,6 +151,7 @@ def write_camera_page(
             )
     page = (
         '<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f"{GENERATOR}"
         f"<title>{escape(title)}</title><style>{STYLE}</style><body>{''.join(parts)}</body></html>\n"
     )
     with atomic_write(file) as aside:

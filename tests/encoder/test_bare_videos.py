@@ -9,6 +9,7 @@ import pytest
 
 import textured_room
 from kpc.encoder.datasets import load_dataset
+from kpc.encoder.evaluation.camera_page import write_camera_page
 from kpc.encoder.poses.footage import find_footage
 from kpc.format.common.errors import DatasetError
 from textured_room import FOCAL, FPS, SIZE, rig, write_films, write_pictures
@@ -182,6 +183,9 @@ def test_only_a_document_of_kpposes_is_replaced(tmp_path, capsys):
             code = ended.code
         assert code == 2 and complaint in capsys.readouterr().err and (tmp_path / output).read_bytes() == before
     (tmp_path / "transforms.json").write_text('{"made_by": "kpposes"}')
+    (tmp_path / "cameras.html").write_text("<title>My cameras</title>")
+    assert kpposes.main([str(tmp_path)]) == 2 and "cameras.html: is no page of KPC and stays" in capsys.readouterr().err
+    write_camera_page(tmp_path / "cameras.html", "found before", [], [])
     assert kpposes.main([str(tmp_path), "--rig", "still"]) == 1 and "depth needs 3 or more" in capsys.readouterr().err
 
 

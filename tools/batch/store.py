@@ -84,17 +84,24 @@ class Store:
         finally:
             temporary.unlink(missing_ok=True)
 
+    def get_text(self, name: str) -> str:
+        """Return what a text in UTF-8 holds.
+
+        Raises:
+            StoreError: it is missing.
+        """
+        with self._errors(name):
+            self._fs.invalidate_cache()
+            return bytes(self._fs.cat_file(self._path(name))).decode(errors="replace")
+
     def get_json(self, name: str) -> Any:
         """Return what a JSON file holds.
 
         Raises:
             StoreError: it is missing or damaged.
         """
-        with self._errors(name):
-            self._fs.invalidate_cache()
-            data = self._fs.cat_file(self._path(name))
         try:
-            return json.loads(data)
+            return json.loads(self.get_text(name))
         except ValueError as error:
             raise StoreError(f"{self.address}/{name}: is damaged; delete it to have it made anew") from error
 

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from urllib.parse import quote
 
+from kpc.format.common.errors import UsageError
 from kpc.tools.batch.jobs import Job
 from kpc.tools.batch.store import SCENE, Store
 from kpc.tools.batch.tasks import Outcome
@@ -11,6 +12,7 @@ from kpc.tools.pages import render
 
 # The folder below the output that all workers share.
 SHARED = ".kpbatch"
+REPORT, MARK = "report.html", "<title>kpbatch</title>"  # by which the page is known
 # Columns of the table: heading, figure, and how it is written.
 COLUMNS = (
     ("bytes", "size_bytes", "{:,}"),
@@ -53,6 +55,16 @@ def print_summary(jobs: Sequence[Job], ended: Mapping[str, Outcome], as_json: bo
             print(f"\n{job.name} failed:\n  " + error.replace("\n", "\n  "))
 
 
+def check_report(output: Store) -> None:
+    """Refuse a place where another report.html than one of `write_report` would be replaced.
+
+    Raises:
+        UsageError: there is one.
+    """
+    if output.exists(REPORT) and MARK not in output.get_text(REPORT):
+        raise UsageError(f"{output.address}/{REPORT}: is no page of kpbatch and stays; move it, or give another place")
+
+
 def write_report(jobs: Sequence[Job], ended: Mapping[str, Outcome], output: Store) -> None:
     """Write report.html: the table, with what went wrong and links to files and logs; it needs no network."""
     rows = []
@@ -64,7 +76,7 @@ def write_report(jobs: Sequence[Job], ended: Mapping[str, Outcome], output: Stor
         rows.append(row)
     done = sum(outcome.is_done for outcome in ended.values())
     headings = [heading for heading, _, _ in COLUMNS]
-    output.put_text(render("batch.html", done=done, rows=rows, headings=headings), "report.html")
+    output.put_text(render("batch.html", done=done, rows=rows, headings=headings), REPORT)
 
 
 def _cells(ended: Mapping[str, Outcome], job: Job) -> list[str]:
