@@ -22,7 +22,7 @@ import pytest
 from distributed import Client, Future, LocalCluster
 
 from kpc.format.common.errors import UsageError
-from kpc.tools.batch import engine, jobs, simulation, working
+from kpc.tools.batch import engine, jobs, simulation, summary, working
 from kpc.tools.batch.addresses import source_address
 from kpc.tools.batch.engine import Engine, Event
 from kpc.tools.batch.jobs import FaultyBatch, Job, Resources
@@ -190,6 +190,27 @@ def test_a_source_is_never_replaced(tmp_path: Path, capsys: pytest.CaptureFixtur
     with pytest.raises(FaultyBatch, match="is the source, too"):
         jobs.check_results(jobs.Batch((Job("a", "s3://place/folder"), replace(other, name="b")), "s3://place"))
     jobs.check_results(jobs.Batch((other, Job("b", str(scene))), str(tmp_path / "out")))
+
+
+def test_places_that_cannot_be_written_are_named_with_their_option(
+    tmp_path: Path, take: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "locked").mkdir()
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "locked" and access(path, mode))
+    monkeypatch.chdir(tmp_path)
+    for *words, option, path in ["-o", "locked/out"], ["-o", "out", "--scratch", "locked"]:
+        assert main([str(take), *words, option, path]) == 1
+        assert f"{path}: no permission to write there; choose another place with {option}" in capsys.readouterr().err
+
+
+def test_only_pages_of_its_own_are_replaced(tmp_path: Path, take: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    summary.write_report((), {}, Store(str(out)))
+    summary.check_report(Store(str(out)))
+    (out / "report.html").write_text("<title>Our report</title>")
+    assert main([str(take), "-o", str(out), "--dry-run"]) == 2
+    assert "report.html: is no page of kpbatch and stays" in capsys.readouterr().err
 
 
 def test_an_empty_folder_is_refused_before_anything_starts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,9 +17,19 @@ from pathlib import Path
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
 from kpc.format.common.text import escaped, notice
-from kpc.tools.batch.jobs import Batch, FaultyBatch, Job, Resources, check_results, jobs_of_folders, read_jobs, resolve
+from kpc.tools.batch.jobs import (
+    ADDRESS,
+    Batch,
+    FaultyBatch,
+    Job,
+    Resources,
+    check_results,
+    jobs_of_folders,
+    read_jobs,
+    resolve,
+)
 from kpc.tools.batch.store import Store
-from kpc.tools.batch.summary import SHARED, print_summary, publish, write_report
+from kpc.tools.batch.summary import SHARED, check_report, print_summary, publish, write_report
 from kpc.tools.batch.tasks import PREPARE, Outcome, done_before, first_tasks, is_last, tasks_of_groups
 
 
@@ -42,8 +52,12 @@ def _command(argv: list[str]) -> None:
         for fault in others:
             cli.print_error("kpbatch", fault)
         raise UsageError(last) from error
+    for place, option in (batch.output, "-o"), (None if options.scheduler else options.scratch, "--scratch"):
+        if place is not None and not ADDRESS.match(place):
+            cli.check_writable(Path(place), is_folder=True, option=option)
     shared = f"{batch.output.rstrip('/')}/{SHARED}"
     store, output = Store(shared), Store(batch.output)
+    check_report(output)
     first, known = first_tasks(batch.jobs), done_before(store)
     if options.dry_run:
         for task in first:
