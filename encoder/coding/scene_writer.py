@@ -8,17 +8,16 @@ import os
 import struct
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
 from kpc.encoder.coding.motion_codec import encode_motion
 from kpc.encoder.coding.occupancy_codec import encode_occupancy
 from kpc.encoder.coding.raw_planes import encode_raw_segment
-from kpc.encoder.coding.segments import choose_codec
+from kpc.encoder.coding.segments import choose_codec, segment_bounds
 from kpc.encoder.coding.weights import encode_weights
 from kpc.format.coding.poses import encode_poses
-from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels, to_half
+from kpc.format.coding.quantise import QuantisedScene, needed_texels, to_half
 from kpc.format.common.errors import FormatError
 from kpc.format.container.container import Chunk, Codec, pack
 from kpc.format.container.metadata_chunk import pack_metadata
@@ -40,7 +39,7 @@ from kpc.format.container.scene_layout import (
     parse_mapping,
     parse_motion,
 )
-from kpc.format.container.segments import rows_per_segment, side_info_at
+from kpc.format.container.segments import side_info_at
 from kpc.format.container.sound_chunk import pack_sound
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import QuantisedMotion
@@ -175,7 +174,7 @@ def _plane_chunks(scene: QuantisedScene, segment_rows: int | None) -> list[Chunk
         (start / len(plane.symbols), number, ALL_PLANES.index(name), start, stop)
         for number, scale in enumerate(scene.scales)
         for name, plane in scale.items()
-        for start, stop in _segment_bounds(plane, name in TIME_PLANES, segment_rows)
+        for start, stop in segment_bounds(plane, name in TIME_PLANES, segment_rows)
     ]
     implied = [
         {name: needed_texels(scene.occupancy, name, *plane.coded.shape) for name, plane in scale.items()}
@@ -204,10 +203,3 @@ def _begin_of_sound(chunk: Chunk, scene: QuantisedScene, segments: Sequence[tupl
     heard_s = (chunk.row_start - scene.sound.pre_skip) / SAMPLE_RATE
     share = heard_s / max(scene.clip.duration_s, 1 / SAMPLE_RATE)
     return max((begin for begin, *_ in segments if begin <= share), default=0.0)
-
-
-def _segment_bounds(plane: QuantisedPlane, over_time: bool, segment_rows: int | None) -> list[tuple[int, int]]:
-    """Return the first row of each segment, and the row after its last."""
-    rows = len(plane.symbols)
-    count = segment_rows if segment_rows and over_time else rows_per_segment(rows, over_time)
-    return list(pairwise([*(plane.starts or range(0, rows, count)), rows]))

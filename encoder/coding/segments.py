@@ -1,15 +1,30 @@
-"""Encoding of plane segments: which of the codecs PREDICTIVE and TRANSFORM a segment takes."""
+"""Encoding of plane segments: their rows, and which of the codecs PREDICTIVE and TRANSFORM a segment takes."""
 
 from collections.abc import Callable
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
 from kpc.encoder.coding.predictive import encode_symbols
+from kpc.format.coding.quantise import QuantisedPlane
 from kpc.format.common.errors import FormatError
 from kpc.format.container.container import Codec
-from kpc.format.container.segments import SegmentSideInfo
+from kpc.format.container.segments import SegmentSideInfo, rows_per_segment
 from kpc.format.core.decoding import decode_segment
+
+
+def segment_bounds(plane: QuantisedPlane, over_time: bool, segment_rows: int | None = None) -> list[tuple[int, int]]:
+    """Return the first row of each segment, and the row after its last.
+
+    Args:
+        plane: to be encoded; if its symbols were chosen for certain segments, these.
+        over_time: whether it is a time plane.
+        segment_rows: rows of a segment of other time planes; None: `rows_per_segment`.
+    """
+    rows, _, channels = plane.symbols.shape
+    count = segment_rows if segment_rows and over_time else rows_per_segment(plane.coded, channels, over_time)
+    return list(pairwise([*(plane.starts or range(0, rows, count)), rows]))
 
 
 def encode_segment(

@@ -52,7 +52,7 @@ from kpc.encoder.rdo.distortion import LAM, cross_channel_errors, distortion_wei
 from kpc.encoder.rdo.texel_map_rdo import choose_coded_texels
 from kpc.format.coding.quantise import QuantisedPlane, bfloat16_ceil, quantise_plane
 from kpc.format.container.container import Codec
-from kpc.format.container.segments import TransformSegments, rows_per_segment
+from kpc.format.container.segments import SEGMENT_NS, TransformSegments, rows_of_segments, transform_ns
 from kpc.format.core.decoding import decode_segment
 from kpc.jit import compiled, inlined
 
@@ -109,9 +109,8 @@ def transform_quantise(
     symbol_step = bfloat16_ceil((STEPS_PER_QUANTISER * UNITS_PER_SYMBOL / quantiser * step).astype(np.float32))
     finer = quantise_plane(values, symbol_step, identity=identity, needed=coded)
     wanted = (values.astype(np.float64) - finer.offset) / finer.step * (UNITS_PER_SYMBOL / quantiser)
-    rows = rows_per_segment(len(values), identity)
-    symbols, bodies = np.zeros(values.shape, np.int8), {}
-    for start in range(0, len(values), rows):
+
+    def encoded(start: int, rows: int) -> bytes:
         own = slice(start, start + rows)
         coded_here = np.ascontiguousarray(coded[own])
         blocks = search_blocks(
@@ -122,10 +121,23 @@ def transform_quantise(
             min(side, largest_side(*coded_here.shape)),
             quantiser,
         )
+        return encode_blocks(blocks, coded_here, None if implied is None else implied[own])
+
+    choices = rows_of_segments(len(values), identity)
+    for rows in choices:
+        bodies: dict[int, bytes] = {}
+        for start in range(0, len(values), rows):
+            bodies[start] = encoded(start, rows)
+            if rows != choices[-1] and transform_ns(bodies[start], values[start : start + rows].size) > SEGMENT_NS:
+                break
+        else:
+            break
+    symbols = np.zeros(values.shape, np.int8)
+    for start, body in bodies.items():
+        own = slice(start, start + rows)
         implied_here = None if implied is None else implied[own]
-        bodies[start] = encode_blocks(blocks, coded_here, implied_here)
         own_rows, columns, channels = symbols[own].shape
-        symbols[own], _ = decode_segment(Codec.TRANSFORM, bodies[start], own_rows, columns, channels, implied_here)
+        symbols[own], _ = decode_segment(Codec.TRANSFORM, body, own_rows, columns, channels, implied_here)
     found = replace(finer, symbols=symbols, coded=coded, side_info=TransformSegments(bodies), starts=tuple(bodies))
     return found, sum(map(len, bodies.values()))
 

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kpc.encoder.coding.segments import encode_segment
+from kpc.encoder.coding.segments import encode_segment, segment_bounds
 from kpc.encoder.rdo.curvature import PerPlane
 from kpc.encoder.rdo.dct_rdo import requested_transform_step, transform_quantise
 from kpc.encoder.rdo.distortion import NO_CORRELATION, PlaneKey, distortion_weights, total_distortion
 from kpc.encoder.rdo.trellis import LOW_RATE_BITS, requested_trellis_step, trellis_quantise
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, looked_up_cells, needed_texels, quantise_scene
-from kpc.format.container.segments import TransformSegments, rows_per_segment, side_info_at
+from kpc.format.container.segments import TransformSegments, side_info_at
 from kpc.format.scene.scene import TIME_PLANES, Scene
 
 # Figures behind these constants: docs/design/rate-distortion.md, "Mode decision".
@@ -180,10 +180,8 @@ def cheapest_mode(
 
 def coded_size(plane: QuantisedPlane, identity: bool, implied: np.ndarray) -> int:
     """Return the size of a plane's segments in bytes."""
-    rows = rows_per_segment(len(plane.symbols), identity)
     segments = [
-        (slice(start, start + rows), side_info_at(plane.side_info, start))
-        for start in range(0, len(plane.symbols), rows)
+        (slice(start, stop), side_info_at(plane.side_info, start)) for start, stop in segment_bounds(plane, identity)
     ]
     return sum(
         len(encode_segment(plane.symbols[own], plane.coded[own], side_info, implied[own]))

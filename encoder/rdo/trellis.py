@@ -126,13 +126,13 @@ class _Search:
     ) -> None:
         self.plane, self.identity, self.correlation, self.mode = plane, identity, correlation, mode
         self._step_ratio = LOW_RATE_STEP_RATIO if mode == DEPENDENT else 1.0
-        self.rows = rows_per_segment(len(values), identity)
         coarser = plane.step / step
         self.wanted = (values.astype(np.float64) - plane.offset) / plane.step
         coded = np.ascontiguousarray(plane.coded)
         weight = distortion_weights(significant, coded)
         if identity:
             coded = choose_coded_texels(self.wanted / self._step_ratio, weight, coded)
+        self.rows = rows_per_segment(coded, values.shape[2], identity)
         self.coded, self.weight = coded, weight * np.float32(coarser**2)
         self.symbols = np.where(coded[..., None], plane.symbols, np.int8(0))
         self.counts = np.zeros((2 * ACTIVITIES, MAGNITUDE_BINS))
@@ -166,11 +166,12 @@ class _Search:
 
     def result(self) -> QuantisedPlane:
         """Return the plane with the symbols found."""
+        starts = tuple(range(0, len(self.symbols), self.rows))
         if self.mode == DEPENDENT:  # symbols depend on predictions, whose weights are part of the file
             side_info = PredictionWeights(self.predictors)
-            return replace(self.plane, symbols=self.symbols, coded=self.coded, side_info=side_info)
+            return replace(self.plane, symbols=self.symbols, coded=self.coded, side_info=side_info, starts=starts)
         coded = np.asarray(self.symbols.any(axis=2)) if self.identity else self.coded
-        return replace(self.plane, symbols=self.symbols, coded=coded)
+        return replace(self.plane, symbols=self.symbols, coded=coded, starts=starts)
 
 
 def _residual_bits(counts: np.ndarray) -> np.ndarray:

@@ -14,19 +14,49 @@ MODE_BITS = 2
 SCALAR, TRELLIS, DEPENDENT = range(3)
 WEIGHT_COUNT = 9  # weights of a set, each in 1/64
 
-# Rows of a segment of a time plane, at least, unless the plane has fewer. Each segment starts without neighbours and
-# with new models: files of 16-row segments are 2 % (room) and 3 % (soldier) larger (docs/design/entropy-coding.md).
+# Rows of a segment of a time plane, at least, unless the plane has fewer or its segments would take too long to decode.
+# Each segment starts without neighbours and with new models: files of 16-row segments are 2 % (room) and 3 % (soldier)
+# larger (docs/design/entropy-coding.md).
 SEGMENT_ROWS = 32
 # Segments have a multiple of this many rows, the largest side of blocks, since blocks do not go beyond a segment.
 ROW_MULTIPLE = 16
+# Nanoseconds that the decoder core takes, of trained planes (docs/design/entropy-coding.md): under PREDICTIVE for each
+# symbol, and more if its texel is coded; under TRANSFORM for each symbol and for each byte.
+PREDICTIVE_NS, CODED_NS = 7, 29
+TRANSFORM_NS, TRANSFORM_BYTE_NS = 6, 270
+# What a segment of a time plane may take, unless it has but ROW_MULTIPLE rows.
+SEGMENT_NS = 3_000_000
 
 
-def rows_per_segment(rows: int, over_time: bool) -> int:
-    """Return the rows of each segment but the last: all of a space plane's, at least SEGMENT_ROWS of a time plane's."""
+def rows_of_segments(rows: int, over_time: bool) -> list[int]:
+    """Return the rows that each segment but the last of a plane may have, falling.
+
+    A space plane is one segment. Those of a time plane have at least SEGMENT_ROWS, the first number, or fewer where
+    they would take too long to decode, and at least ROW_MULTIPLE.
+    """
     if not over_time:
-        return rows
-    count = max(1, rows // SEGMENT_ROWS)
-    return -(-rows // (count * ROW_MULTIPLE)) * ROW_MULTIPLE
+        return [rows]
+    counts = range(max(1, rows // SEGMENT_ROWS), max(1, -(-rows // ROW_MULTIPLE)) + 1)
+    return sorted({-(-rows // (count * ROW_MULTIPLE)) * ROW_MULTIPLE for count in counts}, reverse=True)
+
+
+def rows_per_segment(coded: np.ndarray, channels: int, over_time: bool) -> int:
+    """Return the rows of each segment but the last under PREDICTIVE.
+
+    Args:
+        coded: (H, W) bool, the coded texels of the plane.
+        channels: M, symbols of a texel.
+        over_time: whether it is a time plane.
+    """
+    each_ns = channels * (PREDICTIVE_NS * coded.shape[1] + CODED_NS * coded.sum(axis=1))
+    *more, fewest = rows_of_segments(len(coded), over_time)
+    fitting = (n for n in more if np.add.reduceat(each_ns, range(0, len(coded), n)).max() <= SEGMENT_NS)
+    return next(fitting, fewest)
+
+
+def transform_ns(body: bytes, symbols: int) -> int:
+    """Return about how many nanoseconds the decoder core takes for a segment of so many symbols under TRANSFORM."""
+    return TRANSFORM_NS * symbols + TRANSFORM_BYTE_NS * len(body)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ import pytest
 
 from kpc.encoder.coding import scene_writer
 from kpc.encoder.coding.predictive import ACTIVITIES, encode_symbols, follows_trellis, trellis_transition
+from kpc.encoder.coding.segments import segment_bounds
 from kpc.encoder.rdo import distortion, trellis
 from kpc.encoder.rdo.distortion import NO_CORRELATION
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
@@ -14,7 +15,7 @@ from kpc.encoder.rdo.trellis import MAGNITUDE_BINS, STATES
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
 from kpc.format.container import scene_io
 from kpc.format.container.container import Codec
-from kpc.format.container.segments import TRELLIS, WEIGHT_COUNT, rows_per_segment, side_info_of
+from kpc.format.container.segments import TRELLIS, WEIGHT_COUNT, side_info_of
 from kpc.format.scene.scene import TIME_PLANES, Scene
 from scenes import tiny_scene
 
@@ -281,8 +282,7 @@ def test_low_rates_use_dependent_mode(identity: bool) -> None:
     rounded = quantise_plane(values, step, identity=identity)
 
     def cost(plane: QuantisedPlane) -> float:
-        segments = range(0, len(values), rows_per_segment(len(values), identity))
-        parts = [slice(start, start + segments.step) for start in segments]
+        parts = [slice(*bounds) for bounds in segment_bounds(plane, identity)]
         bodies = [encode_symbols(plane.symbols[rows], plane.coded[rows], plane.side_info) for rows in parts]
         assert all(side_info_of(Codec.PREDICTIVE, body) == plane.side_info for body in bodies)
         errors = plane.dequantise() - values
