@@ -386,6 +386,8 @@ def _add_coding_options(parser: argparse.ArgumentParser) -> None:
 def _check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     if given.output is None:
         parser.error("-o names the file to write; give for example -o scene.kpc")
+    if given.source.suffix.lower() in (".kpc", ".kpck") and not given.source.exists():
+        parser.error(f"{given.source}: no such file")
     if given.source.is_file():
         for name, value in vars(given).items():
             if name not in TRANSCODE_OPTIONS and value != parser.get_default(name):

@@ -88,7 +88,9 @@ def read_checkpoint(path: Path) -> tuple[Scene, ValidationRays]:
     except FormatError as error:
         raise TrainingError(f"{path}: not a usable checkpoint ({error})") from error
     except Exception as error:  # a damaged file may raise anything
-        raise TrainingError(f"{path}: not a usable checkpoint ({type(error).__name__}); train anew") from error
+        raise TrainingError(
+            f"{path}: not a usable checkpoint ({type(error).__name__}); copy it or train anew"
+        ) from error
     return scene, validation
 
 
