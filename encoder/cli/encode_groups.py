@@ -18,7 +18,7 @@ from kpc.encoder.cli.encode_scene import encode_scene
 from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group, spans_of
 from kpc.encoder.cli.metadata import clip_metadata, hash_dataset
 from kpc.encoder.cli.options import Options
-from kpc.encoder.cli.prepare import Setting, prepare_setting, trim_with_progress
+from kpc.encoder.cli.prepare import Setting, find_layers, prepare_setting, trim_with_progress
 from kpc.encoder.cli.report import log
 from kpc.encoder.cli.sound import sound_of_span
 from kpc.encoder.cli.transcode import combine_figures
@@ -53,6 +53,9 @@ def encode_groups(options: Options) -> dict[str, Any]:
         setting = replace(setting, aabb=scene_io.SceneReader(first).head.aabb, is_final=True)
     elif not setting.is_final:
         setting = _trim_for_groups(setting, options, spans)
+    config = options.config(setting.dataset)
+    layers = find_layers(options, config, setting.dataset, setting.aabb, setting.mapping)
+    setting = replace(setting, layers=layers)
     found: list[dict[str, Any]] = []
     for number in numbers:
         span, path = spans[number], group_path(work, number)

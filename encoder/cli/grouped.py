@@ -82,13 +82,14 @@ def initialise_from(field: Field, before: Scene) -> None:
     """Initialise a field from the end of a scene of the same layout, but for its rows in time.
 
     Space planes and decoder are copied; time planes and motion take the scene's last row at all times. Appearance
-    embeddings are copied where there are as many.
+    embeddings are copied where there are as many. Of the scene, only what the field holds is taken.
     """
     earlier = Field.from_scene(before)
     with torch.no_grad():
         for scale, name, *_ in field.layout.planes():
-            plane = earlier.plane(scale, name)
-            field.plane(scale, name)[:] = plane[-1:] if name in TIME_PLANES else plane
+            rows, columns = field.layout.rectangle(scale, name)
+            plane = earlier.plane(scale, name)[:, columns]
+            field.plane(scale, name)[:] = plane[-1:] if name in TIME_PLANES else plane[rows]
         if field.motion is not None and earlier.motion is not None:
             field.motion[:] = earlier.motion[-1:]
         for name, value in earlier.named_parameters():

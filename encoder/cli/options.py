@@ -402,8 +402,6 @@ def _check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         parser.error("--audio none leaves the sound out; drop --audio-bitrate")
     if given.steps is not None and given.time_budget is not None:
         parser.error("--steps and --time-budget both say how long to train; drop one")
-    if given.layers != "one" and given.group is not None:
-        parser.error("--layers auto is for clips in one piece; drop it, or --group")
     if given.dry_run and given.resume:
         parser.error("--dry-run estimates a whole run; drop --resume")
 

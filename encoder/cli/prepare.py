@@ -43,6 +43,13 @@ from kpc.format.scene.space import FARTHEST_BOX, Contraction, DeviceCoordinates,
 
 
 @dataclass(frozen=True)
+class Layers:
+    """Whether what moves has scales of its own. `area`: where they are; None: there are none."""
+
+    area: MovingArea | None = None
+
+
+@dataclass(frozen=True)
 class Setting:
     """A dataset to be encoded, and the space that it fills.
 
@@ -56,6 +63,7 @@ class Setting:
         sound: of the clip; None if it is silent.
         sound_from: the track that it is from, as --audio names it.
         refined: what of the cameras an earlier group of the clip has refined.
+        layers: what `find_layers` found for all groups of the clip; None to find it for this dataset.
     """
 
     dataset: Dataset
@@ -67,6 +75,7 @@ class Setting:
     sound: Sound | None = None
     sound_from: str = Options.audio
     refined: str = "none"
+    layers: Layers | None = None
 
 
 @contextlib.contextmanager
@@ -152,8 +161,8 @@ def prepare_trainer(options: Options, setting: Setting) -> Trainer:
         else:
             assert not isinstance(mapping, Contraction)
             aabb, survey_s = trim_with_progress(dataset, config, aabb, options.time_budget_s, mapping)
-    moving = None
-    if options.layers == "auto" and (moving := _find_moving_area(config, dataset, aabb, mapping)) is not None:
+    moving = (setting.layers or find_layers(options, config, dataset, aabb, mapping)).area
+    if moving is not None:
         config = replace(config, moving_area=moving.box)
     trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s, mapping=mapping, moving=moving)
     log(*describe_model(trainer).split("\n"))
@@ -166,17 +175,23 @@ def prepare_trainer(options: Options, setting: Setting) -> Trainer:
     return trainer
 
 
-def _find_moving_area(
-    config: TrainConfig, dataset: Dataset, aabb: np.ndarray, mapping: SpaceMapping | None
-) -> MovingArea | None:
-    """Return the area in which things move, and log the reason."""
+def find_layers(
+    options: Options, config: TrainConfig, dataset: Dataset, aabb: np.ndarray, mapping: SpaceMapping | None
+) -> Layers:
+    """Find whether what moves in a dataset is to have scales of its own, as `options.layers` says, and log the reason.
+
+    Args:
+        aabb: (2, 3), the box of the planes, as it stays. mapping: how space beyond it is held.
+    """
+    if options.layers == "one":
+        return Layers()
     area, why = None, "nothing moves"
     if config.motion_cells or config.summed:
         why = "the model is of another kind"
     elif dataset.is_dynamic:
         area, why = find_moving_area(dataset, aabb, mapping)
     log(f"layers: {'all in one' if area is None else 'what moves has scales of its own'} ({why})")
-    return area
+    return Layers(area)
 
 
 def trim_with_progress(

@@ -14,10 +14,13 @@ from kpc.encoder.evaluation.moving import MovingPixels
 from kpc.encoder.field.bounds import cell_centres, world_points
 from kpc.encoder.field.occupancy_grid import dilate
 from kpc.encoder.training.importance import has_static_cameras
+from kpc.format.common.progress import progress
 from kpc.format.scene.space import SpaceMapping
 
-# Points along each axis, and times, at which the visual hull of what moves is found.
-POINTS, TIMES = 64, 12
+# Points along each axis at which the visual hull of what moves is found.
+POINTS = 64
+# The least number of times for that, and the most frames from one to the next.
+TIMES, FRAMES_APART = 12, 4
 # Share of the cameras that must see a point, and of those that must see something move there.
 SEEN, MOVING = 0.6, 0.9
 # Added on every side, in shares of the space, besides half the distance between points: nothing moves beyond.
@@ -74,14 +77,15 @@ def find_moving_area(dataset: Dataset, aabb: np.ndarray, mapping: SpaceMapping |
 
 
 def _hull(dataset: Dataset, points: np.ndarray) -> np.ndarray:
-    """Return whether points (N, 3) lie in what moves, at any of TIMES times: (N,) bool."""
+    """Return whether points (N, 3) lie in what moves, at any of several times: (N,) bool."""
     pictures, moving, pinholes = dataset.pictures, MovingPixels(dataset), covering_pinholes(dataset.pictures)
     train = np.flatnonzero(~pictures.is_test)
     cameras, times = np.unique(pictures.camera[train]), np.unique(pictures.time[train])
-    times = times[np.linspace(0, len(times) - 1, min(TIMES, len(times))).round().astype(int)]
+    count = min(max(TIMES, -(-len(times) // FRAMES_APART)), len(times))
+    times = times[np.linspace(0, len(times) - 1, count).round().astype(int)]
     seen = np.zeros((len(times), len(points)), np.int32)
     moves = np.zeros_like(seen)
-    for camera in cameras:
+    for camera in progress(cameras, "finding where things move", unit="cameras"):
         own = train[pictures.camera[train] == camera]
         for k, time in enumerate(times):
             number = int(own[np.argmin(np.abs(pictures.time[own] - time))])

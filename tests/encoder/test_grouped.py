@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import datasets as make
-from kpc.encoder.cli import kpenc
+from kpc.encoder.cli import kpenc, prepare
 from kpc.encoder.cli.encode_groups import plan_groups
 from kpc.encoder.cli.estimate import Estimate
 from kpc.encoder.cli.grouped import (
@@ -30,6 +30,7 @@ from kpc.encoder.field.config import PRESETS
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.layout import Layout
 from kpc.encoder.rdo.rate_control import Trade
+from kpc.encoder.training.moving_area import MovingArea
 from kpc.encoder.training.train import Trainer
 from kpc.format.common.errors import DatasetError, UsageError
 from kpc.format.container import scene_io
@@ -38,7 +39,7 @@ from kpc.format.container.groups import Groups, Span, Timeline
 from kpc.format.scene.scene import Clip
 from kpc.tools.bench import group_joins
 from kpc.tools.cli import kpjoin
-from training_runs import TINY
+from training_runs import BOX, TINY
 
 pytestmark = pytest.mark.usefixtures("one_thread", "quick_coding", "rounded", "tiny")
 FRAMES = 26
@@ -118,6 +119,27 @@ def test_a_field_starts_from_the_last_row_of_another():
     assert later.theta.requires_grad and later.theta.is_leaf
 
 
+def test_a_field_with_an_area_starts_from_another_of_its_layout():
+    """Those texels of the planes of the whole box are taken that the area holds."""
+    spans = np.array([[[0, 6], [0, 5], [0, 4]], [[3, 5], [2, 6], [0, 7]]])
+
+    def field(rows: int, seed: int) -> Field:
+        layout = Layout.of(np.array([[6, 5, 4, 0], [12, 10, 8, rows]]), 2, spans)
+        made = Field(layout, 4, torch.Generator().manual_seed(seed))
+        with torch.no_grad():
+            made.theta += torch.rand(made.theta.shape, generator=torch.Generator().manual_seed(seed + 9))
+        made.clear_border()
+        return made
+
+    earlier, later = field(6, 0), field(4, 1)
+    scene = earlier.to_scene(BOX, Clip(12, 8.0), np.ones((1, 2, 2, 2), bool), np.ones(3), 0.1)
+    initialise_from(later, scene)
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(3))
+    at_the_end = earlier.features(points, torch.ones(50))
+    for time in (0.0, 1.0):
+        assert torch.allclose(later.features(points, torch.full((50,), time)), at_the_end, atol=1e-5)
+
+
 def test_later_groups_start_with_all_scales(tmp_path):
     make.write_blender(tmp_path / "set")
     options = Options(tmp_path / "set", tmp_path / "out.kpc", preset="draft", box=((-1, -1, -1), (1, 1, 1)))
@@ -192,6 +214,25 @@ def test_a_long_clip_becomes_a_file_of_groups(videos, tmp_path, capsys):
         5 < join["agreement_db"] < 100 for join in found["joins"]
     )
     assert np.mean([frame["psnr"] for frame in found["frames"]]) == pytest.approx(result["test_psnr"], abs=0.5)
+
+
+def test_groups_share_the_area_in_which_things_move(videos, tmp_path, monkeypatch, capsys):
+    """It is found once, on the frames of all groups."""
+    searched = []
+
+    def found(dataset: Dataset, aabb: np.ndarray, mapping: None) -> tuple[MovingArea, str]:
+        searched.append(dataset.clip.frame_count)
+        return MovingArea((0.3, 0.3, 0.2, 0.8, 0.9, 0.7), np.ones((64, 64, 64), bool)), "so it is"
+
+    monkeypatch.setattr(prepare, "find_moving_area", found)
+    output = tmp_path / "long.kpc"
+    assert encode(videos, output, "--layers", "auto") == 0
+    assert searched == [FRAMES] and capsys.readouterr().err.count("layers:") == 1
+    opened = Groups(output)
+    shapes = [
+        [scale["xy"].symbols.shape[:2] for scale in scene_io.read(opened.open(number)).scales] for number in range(3)
+    ]
+    assert len(shapes[0]) == 4 and shapes[0] == shapes[1] == shapes[2]
 
 
 def test_an_interrupted_run_resumes_in_its_group_to_the_same_file(videos, tmp_path, monkeypatch, capsys):

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import datasets as make
-from kpc.encoder.cli.kpenc import main
 from kpc.encoder.coding.scene_writer import write
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.field.config import TrainConfig
@@ -177,9 +176,3 @@ def test_no_area_is_found_where_cameras_move_or_all_of_space_does(moving: Datase
     assert find_moving_area(moving, BOX, None) == (None, "cameras move, or show one picture each")
     area, why = find_moving_area(rolling, np.array([[-0.9, -0.3, -0.3], [0.9, 0.3, 0.3]], np.float32), None)
     assert area is None and "of the space" in why
-
-
-def test_layers_are_refused_for_clips_in_groups(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main([str(tmp_path), "-o", str(tmp_path / "a.kpc"), "--layers", "auto", "--group", "1s"])
-    assert "--layers auto is for clips in one piece" in capsys.readouterr().err
