@@ -107,6 +107,9 @@ class TrainConfig:
     scale_dropout: float = 0.0
     # Peak learning rate of the planes. K-Planes uses 1e-2 with 30,000 steps.
     learning_rate: float = 4e-2
+    # Peak learning rate of factors on whole rows and columns of planes that hold what stands still, where something
+    # moves, as a share of `learning_rate`; 0 for none (measured; `kpc.encoder.training.line_steps`).
+    line_rate: float = 0.5
     # Peak learning rate of the decoder.
     decoder_learning_rate: float = 1e-2
     # Peak learning rate of the motion grid, in box edges. Soldier loses 0.1 dB with 5e-3, 0.2 dB with 2e-2.

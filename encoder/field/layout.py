@@ -18,6 +18,9 @@ AXES = "xyzt"
 # if they covered the box.
 MOST_FINER = 3.0
 
+# Rows of a block in `Layout.line_blocks`, at most.
+BLOCK_ROWS = 16
+
 # Rows of a plane that lie so far apart in it follow each other in `Layout.plane_rows`.
 DEALT = 64
 
@@ -88,6 +91,32 @@ class Layout:
             for row in range(count)
         ]
         return np.array([row for first in range(DEALT) for row in rows[first::DEALT]], np.int64)
+
+    @functools.cached_property
+    def line_blocks(self) -> np.ndarray:
+        """(B, 6) int64: for blocks of rows of the `lined_planes` where the plane begins in theta, the block's first row
+        and the one after its last, how many columns and rows the plane has, and the number of its first line.
+
+        Lines are the rows of a plane and then its columns, plane by plane.
+        """
+        blocks, line = [], 0
+        for start, rows, columns in self.lined_planes:
+            for first in range(0, rows, BLOCK_ROWS):
+                blocks.append([start, first, min(first + BLOCK_ROWS, rows), columns, rows, line])
+            line += rows + columns
+        return np.array(blocks, np.int64).reshape(-1, 6)
+
+    @property
+    def lined_planes(self) -> list[tuple[int, int, int]]:
+        """(start, rows, columns) of each plane that `kpc.encoder.training.line_steps` concerns: of scales without
+        space-time planes, where others have some."""
+        is_lined = self.is_dynamic & (self.resolution[:, 3] == 0)
+        return [(start, rows, columns) for s, _, start, rows, columns in self.planes() if is_lined[s]]
+
+    @property
+    def lines(self) -> int:
+        """The number of rows and columns of the `lined_planes`."""
+        return sum(rows + columns for _, rows, columns in self.lined_planes)
 
     def rectangle(self, scale: int, name: str) -> tuple[slice, slice]:
         """Return which rows and columns of a plane of the whole box are held."""

@@ -174,6 +174,7 @@ def _field_and_optimiser(scene: Scene, steps: int) -> tuple[Field, FusedOptimise
     config = replace(
         TrainConfig(),
         learning_rate=LEARNING_RATE,
+        line_rate=0.0,
         decoder_learning_rate=DECODER_LEARNING_RATE,
         appearance_learning_rate=0.0,
         view_dependent=not explicit or bool(scene.decoder.w2.any()),

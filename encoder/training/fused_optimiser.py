@@ -13,6 +13,7 @@ from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import max_samples_per_ray
 from kpc.encoder.field.priors import appearance_priors, motion_priors
 from kpc.encoder.field.render import Rays
+from kpc.encoder.training.line_steps import line_steps
 from kpc.encoder.training.optimisers import (
     BETA1,
     BETA2,
@@ -50,6 +51,7 @@ class FusedOptimiser:
         self.mean, self.square = np.zeros_like(self.theta), np.zeros_like(self.theta)
         self._peaks = np.zeros((self.workers, *cells), np.float32)
         self.decoder = decoder_optimiser(field, config)
+        self.lines = line_steps(field, config)
         self.ray_gradients = np.zeros((1, kernels.RAY_GRADIENTS), np.float32)
 
     def peaks(self) -> np.ndarray:
@@ -112,6 +114,9 @@ class FusedOptimiser:
             self._step_decoder(basis, mask, gradients, rate)
             if batch.directions.grad is not None:
                 self.ray_gradients[:, 3:6] += batch.directions.grad.numpy()
+        if self.lines is not None:
+            with self.timers("lines"):
+                self.lines.step(rate, self.grad)
         with self.timers("adam"):
             learning_rate = config.learning_rate * rate
             kernels.adam(
@@ -166,6 +171,7 @@ class FusedOptimiser:
             "square": torch.from_numpy(self.square),
             "peaks": torch.from_numpy(self._peaks.max(0)),
             "decoder": self.decoder.state_dict(),
+            "lines": self.lines and self.lines.state(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -173,3 +179,5 @@ class FusedOptimiser:
         self.mean[:], self.square[:] = state["mean"].numpy(), state["square"].numpy()
         self._peaks[:] = state["peaks"].numpy()
         self.decoder.load_state_dict(state["decoder"])
+        if self.lines is not None:
+            self.lines.load(state["lines"])

@@ -19,6 +19,7 @@ from kpc.encoder.field.priors import appearance_priors, motion_priors, plane_pri
 from kpc.encoder.field.proposals import ProposalLevel, Proposals, histogram_loss
 from kpc.encoder.field.render import Rays, Samples, follow_rays, sample_rays, select_reached, shade, weigh_samples
 from kpc.encoder.training.cuda_graphs import GraphCache
+from kpc.encoder.training.line_steps import line_steps
 from kpc.encoder.training.optimisers import (
     Stopwatch,
     add_prior_gradients,
@@ -128,6 +129,7 @@ class TorchOptimiser:
             each.mixed = config.mixed_precision and self._on_gpu
         self.planes = make_adam([([each.theta for each in self.fields], config.learning_rate)])
         self.decoder = decoder_optimiser(field, config, [each.density for each in self.fields[1:]])
+        self.lines = line_steps(field, config)
         optimisers = self.planes, self.decoder
         self._graphs = GraphCache(
             [p for optimiser in optimisers for group in optimiser.param_groups for p in group["params"]]
@@ -199,6 +201,9 @@ class TorchOptimiser:
             for each in self.fields if variation is not None and self.fused else ():
                 theta, grad = each.theta.detach().numpy(), each.theta.grad.numpy()  # type: ignore[union-attr]
                 add_prior_gradients(each, theta, grad, config, variation, config.regularise_every)  # type: ignore[arg-type]
+        if self.lines is not None:
+            with self.timers("lines"):
+                self.lines.step(rate)
         with self.timers("adam"):
             self.planes.step()
             self.decoder.step()
@@ -291,6 +296,7 @@ class TorchOptimiser:
             "planes": self.planes.state_dict(),
             "decoder": self.decoder.state_dict(),
             "peaks": self._peaks,
+            "lines": self.lines and self.lines.state(),
             "proposals": self.proposals and self.proposals.state_dict(),
         }
 
@@ -299,6 +305,8 @@ class TorchOptimiser:
         self._peaks.copy_(state["peaks"])
         self.planes.load_state_dict(state["planes"])
         self.decoder.load_state_dict(state["decoder"])
+        if self.lines is not None:
+            self.lines.load(state["lines"])
         if self.proposals is not None:
             self.proposals.load_state_dict(state["proposals"])
 

@@ -22,7 +22,7 @@ Modules
     marching     one ray through the field; rendering; lists of samples
     backward     the gradient of a batch's loss
     points       features and densities at given points
-    updates      Adam and the gradients of the priors
+    updates      Adam, factors of rows and columns, and the gradients of the priors
 
 Numba's on-disk cache notices a change in the file of the function that was called, not in the files of functions that
 it calls: after editing a module here, delete `__pycache__`.
@@ -33,7 +33,7 @@ from kpc.encoder.field.kernels.backward import backpropagate
 from kpc.encoder.field.kernels.marching import collect_samples, render
 from kpc.encoder.field.kernels.points import features, log_densities, scatter_features
 from kpc.encoder.field.kernels.texels import AXES, PLACES
-from kpc.encoder.field.kernels.updates import adam, add_priors
+from kpc.encoder.field.kernels.updates import adam, add_priors, line_gradients, scale_lines
 
 __all__ = [
     "AXES",
@@ -49,7 +49,9 @@ __all__ = [
     "backpropagate",
     "collect_samples",
     "features",
+    "line_gradients",
     "log_densities",
     "render",
+    "scale_lines",
     "scatter_features",
 ]

@@ -1,4 +1,4 @@
-"""Adam, and the gradients of the priors on planes."""
+"""Adam, factors of rows and columns, and the gradients of the priors on planes."""
 
 import math
 
@@ -44,6 +44,48 @@ def adam(theta, grad, mean, square, lr, beta1, beta2, epsilon, step_number):
             m[i] = m_i if abs(m_i) > TINY else np.float32(0.0)
             v[i] = v_i if v_i > TINY else np.float32(0.0)
             p[i] -= rate * (m[i] / correction1) / (math.sqrt(v[i] / correction2) + eps)
+
+
+@parallel
+def line_gradients(theta, grad, blocks, M, found, parts):
+    """Find the gradients of factors on rows and columns of planes (`kpc.encoder.training.line_steps`).
+
+    Args:
+        theta: (n,) float32. grad: (workers, n) float32, whose sum is the gradient.
+        blocks: (B, 6) int64, `Layout.line_blocks`.
+        M: channels.
+        found: (lines, M) float32 zeros, in which those of rows are set.
+        parts: (B, columns M) float32 zeros, in which what each block adds to those of its plane's columns is set.
+    """
+    workers = grad.shape[0]
+    for b in prange(len(blocks)):
+        start, first, last, columns, line = blocks[b, 0], blocks[b, 1], blocks[b, 2], blocks[b, 3], blocks[b, 5]
+        width = columns * M
+        part = parts[b]
+        for row in range(first, last):
+            lo = start + row * width
+            own, texels = found[line + row], theta[lo : lo + width]
+            for worker in range(workers):
+                slope = grad[worker, lo : lo + width]
+                for i in range(width):
+                    part[i] += texels[i] * slope[i]
+                for column in range(columns):
+                    for c in range(M):
+                        own[c] += texels[column * M + c] * slope[column * M + c]
+
+
+@parallel
+def scale_lines(theta, factors, blocks, M):
+    """Multiply planes in theta (n,) by 1 + the factors (lines, M) of their rows, and of their columns."""
+    one = np.float32(1.0)
+    for b in prange(len(blocks)):
+        start, first, last, columns, line = blocks[b, 0], blocks[b, 1], blocks[b, 2], blocks[b, 3], blocks[b, 5]
+        for row in range(first, last):
+            of_row = factors[line + row]
+            for column in range(columns):
+                lo, of_column = start + (row * columns + column) * M, factors[line + blocks[b, 4] + column]
+                for c in range(M):
+                    theta[lo + c] *= (one + of_row[c]) * (one + of_column[c])
 
 
 @inlined
