@@ -179,6 +179,28 @@ def with_record(page: str, written: Mapping[str, Path | bytes]) -> str:
     return page.replace(GENERATOR, GENERATOR + "\n" + Template(RECORD).substitute(files=listed), 1)
 
 
+def own_files(folder: Path, wanted: Mapping[str, Path | bytes]) -> dict[str, Path | bytes]:
+    """Return those of the files that are to be written which its page may record: they may be replaced later.
+
+    A file of the user that lies in the folder already is not among them, unless its page records it: neither a source
+    nor a copy of one.
+
+    Args:
+        folder: that is to be written, as it is before.
+        wanted: what is to be written, by names: files of the user as paths, all else as bytes.
+    """
+    page = folder / PAGE
+    written = _recorded(page.read_text(errors="replace")) if page.is_file() else {}
+
+    def is_own(name: str, content: Path | bytes) -> bool:
+        path = folder / name
+        if isinstance(content, bytes) or not path.exists():
+            return True
+        return name in written and not path.samefile(content)
+
+    return {name: content for name, content in wanted.items() if is_own(name, content)}
+
+
 def _recorded(page: str) -> dict[str, str]:
     """Return the checksums of files by their names that a page records."""
     before, _, after = RECORD.partition("$files")
@@ -201,8 +223,11 @@ def write_file(path: Path, content: str | bytes) -> None:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def copy_file(source: Path, target: Path) -> None:
-    """Copy a file, whole or not at all; a file that lies there already stays."""
+def copy_file(source: Path | bytes, target: Path) -> None:
+    """Copy a file or write bytes, whole or not at all; a source that lies there already stays."""
+    if isinstance(source, bytes):
+        write_file(target, source)
+        return
     if target.exists() and target.samefile(source):
         return
     with atomic_write(target) as temporary:

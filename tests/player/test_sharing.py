@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from kpc.format.common.errors import FormatError
+from kpc.format.container.rewriting import with_metadata
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Clip
 from kpc.player.app import kpplay
@@ -174,6 +175,26 @@ def test_files_of_someone_else_stay_and_own_ones_are_replaced(
     assert kpshare.main(command) == 0 and (tmp_path / name).read_bytes() != b"older", "its own file is replaced"
     (tmp_path / name).write_text("mine")
     assert kpshare.main(command) == 2 and (tmp_path / name).read_text() == "mine", "but not what was put in its place"
+
+
+def test_a_scene_that_lay_in_the_folder_is_never_replaced(
+    tmp_path: Path, quick_posters: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sources = [tmp_path / name / "a.kpc" for name in ("site", "copy", "other")]
+    for source in sources:
+        source.parent.mkdir()
+        shutil.copy(SAMPLE, source)
+    edited = with_metadata(SAMPLE.read_bytes(), Metadata({"title": "other"}))
+    sources[2].write_bytes(edited)
+    for shared_before in sources[:2]:
+        assert kpshare.main([str(shared_before), "-o", str(tmp_path / "site")]) == 0
+        assert kpshare.main([str(sources[2]), "-o", str(tmp_path / "site")]) == 2
+        assert "a.kpc: is another file, and stays" in capsys.readouterr().err
+        assert sources[0].read_bytes() == SAMPLE.read_bytes()
+    sources[0].unlink()
+    for source in sources[1:]:
+        assert kpshare.main([str(source), "-o", str(tmp_path / "site")]) == 0, "its own copies are replaced"
+    assert sources[0].read_bytes() == edited
 
 
 def test_what_is_no_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

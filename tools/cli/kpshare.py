@@ -47,7 +47,7 @@ def _command(argv: list[str]) -> None:
     at_page = {} if is_gallery else player  # those of a gallery lie above its pages
     if is_gallery:
         site.check_folder(folder, player)
-    beside: list[dict[str, Path]] = [{f"{name}.kpc": file} for file, name in zip(files, names, strict=True)]
+    beside: list[dict[str, Path | bytes]] = [{f"{name}.kpc": file} for file, name in zip(files, names, strict=True)]
     for place, wanted in zip(folders, beside, strict=True):
         site.check_folder(place, {**at_page, **wanted})
     root = "../" if is_gallery else ""
@@ -57,17 +57,18 @@ def _command(argv: list[str]) -> None:
         inputs = progress(list(zip(files, names, posters, strict=True)), "kpshare", unit="scenes")
         scenes = {name: _read(file, name, poster) for file, name, poster in inputs}
         for place, wanted, poster in zip(folders, beside, posters, strict=True):
-            wanted[site.POSTER] = poster
+            wanted[site.POSTER] = poster.read_bytes()
             site.check_folder(place, {**at_page, **wanted})
         folder.mkdir(parents=True, exist_ok=True)
         site.copy_player(folder)
         for (name, scene), place, wanted in zip(scenes.items(), folders, beside, strict=True):
             place.mkdir(exist_ok=True)
+            own = site.own_files(place, {**at_page, **wanted})
             for beside_name, source in wanted.items():
                 site.copy_file(source, place / beside_name)
             url = None if options.url is None else urljoin(options.url, f"{name}/" if is_gallery else "")
             page = site.scene_page(scene, root=root, url=url)
-            site.write_file(place / site.PAGE, site.with_record(page, {**at_page, **wanted}))
+            site.write_file(place / site.PAGE, site.with_record(page, own))
     if is_gallery:
         title = options.title or (options.gallery or folder).absolute().name
         site.write_file(folder / site.PAGE, site.with_record(site.gallery_page(scenes, title, options.url), player))
