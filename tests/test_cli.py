@@ -93,6 +93,22 @@ def test_the_target_of_a_symbolic_link_is_written_and_keeps_its_permissions(tmp_
         cli.check_writable(tmp_path / "lost.kpc")
 
 
+def test_a_link_to_a_file_of_another_kind_is_no_output(tmp_path: Path) -> None:
+    """It may be the scene that is rendered."""
+    (tmp_path / "scene.kpc").write_bytes(b"whole")
+    (tmp_path / "picture.png").symlink_to("scene.kpc")
+    for write in cli.check_writable, lambda path: rewriting.save(b"other", path):
+        with pytest.raises(OSError, match=r"is a link to scene\.kpc, a file of another kind"):
+            write(tmp_path / "picture.png")
+    assert (tmp_path / "scene.kpc").read_bytes() == b"whole"
+
+
+def test_a_link_that_leads_nowhere_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "frames").symlink_to("nowhere")
+    with pytest.raises(UsageError, match="frames: is a link that leads nowhere"):
+        cli.check_writable(tmp_path / "frames", is_folder=True)
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
 def test_pipes_and_devices_are_no_outputs(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.kpc")

@@ -148,12 +148,16 @@ def file_written(path: Path) -> tuple[Path, int]:
     """Return the file that is written under a name, and the permissions that it gets.
 
     It is the file of that name, there or not, or the target of a symbolic link. Folders, pipes and devices, which a
-    file renamed to their name would replace, are refused.
+    file renamed to their name would replace, are refused; so are links to files with another suffix, which may be the
+    very file that is read.
 
     Raises:
         OSError: it is none of these, or a link leads nowhere; the error names `path`.
     """
     written = Path(os.path.realpath(path)) if path.is_symlink() else path
+    if written.suffix.lower() not in ("", path.suffix.lower()):
+        reason = f"is a link to {escaped(written.name)}, a file of another kind; give another name"
+        raise OSError(errno.EINVAL, reason, str(path))
     try:
         mode = os.stat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):  # of which the writer complains
@@ -192,10 +196,12 @@ def check_writable(path: Path, *, is_folder: bool = False, option: str = "-o") -
         if above.exists() and not os.access(above, os.W_OK):  # renaming would replace it all the same
             raise OSError(errno.EACCES, f"is write-protected; choose another name with {option}", str(path))
         above = above.parent
-    while is_folder and not above.exists() and above != above.parent:
+    while is_folder and not os.path.lexists(above) and above != above.parent:
         above = above.parent
     if above.exists() and not above.is_dir():
         raise UsageError(f"{above}: is a file, not a folder; give another name")
+    if above.is_symlink() and not above.exists():
+        raise UsageError(f"{above}: is a link that leads nowhere; give another name")
     if not above.is_dir():
         raise UsageError(f"{above}: no such folder; make it first, or choose another place with {option}")
     if not os.access(above, os.W_OK):
