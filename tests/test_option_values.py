@@ -4,6 +4,7 @@ import argparse
 import functools
 import importlib
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -39,11 +40,12 @@ def test_no_message_names_a_function(module: str, monkeypatch: pytest.MonkeyPatc
         with pytest.raises(Found) as found:
             importlib.import_module(module).main(words)
         for action in options_of(found.value.args[0]):
-            for text in ("nan", "x", "-1", "1e999", "\u00b2", "9" * 5000, "k", "=:,"):
+            for text in ("", "nan", "x", "-1", "1e999", "\u00b2", "9" * 5000, "k", "=:,"):
                 if action.type is None or (action.type is int and action.choices):
                     continue
                 try:
-                    action.type(text)  # type: ignore[operator]
+                    value = action.type(text)  # type: ignore[operator]
+                    assert value != Path(), f"{action.dest}: an empty name is read as the working directory"
                 except argparse.ArgumentTypeError as error:  # of another error argparse prints the function's name
                     refused += "invalid" not in str(error)
     assert refused or module.endswith("kpjoin")

@@ -129,7 +129,9 @@ def _parser() -> argparse.ArgumentParser:
         help="hold this frame rate by changing the quality "
         f"(default: as last time; at first {GPU_FPS:.0f} on a graphics card)",
     )
-    parser.add_argument("--path", metavar="JSON", help="a saved camera path, which the key J follows")
+    parser.add_argument(
+        "--path", type=cli.file_name, metavar="JSON", help="a saved camera path, which the key J follows"
+    )
     parser.add_argument(
         "--folder",
         type=cli.file_name,

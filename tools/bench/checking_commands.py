@@ -47,7 +47,7 @@ def add_parsers(kinds: Any) -> None:
 
     for parser in (quality, pictures):
         parser.add_argument("scene", type=cli.input_path, metavar="SCENE", help="a .kpc file")
-        parser.add_argument("dataset", type=Path, metavar="DATASET", help="the folder that it was made from")
+        parser.add_argument("dataset", type=cli.named_path, metavar="DATASET", help="the folder that it was made from")
         parser.add_argument("--holdout", metavar="NAME", help="camera or file to compare with (default: as encoded)")
         parser.add_argument(
             "--downscale",

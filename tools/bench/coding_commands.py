@@ -24,7 +24,7 @@ def add_parsers(kinds: Any) -> None:
     harness.add_scenes(codec, help="finished checkpoints (kpenc --keep-checkpoint) or .kpc files")
     codec.add_argument(
         "--dataset",
-        type=Path,
+        type=cli.named_path,
         action="append",
         metavar="DIR",
         help="measure distortion on its held-out views; once for each scene, in the same order (default: on training "

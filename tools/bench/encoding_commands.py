@@ -92,12 +92,15 @@ def add_parsers(kinds: Any) -> None:
                 "--test-views", type=harness.positive, metavar="N", help="test on at most N held-out pictures, not all"
             )
         parser.add_argument(
-            "--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files, and the .kpck files for `codec`, here"
+            "--keep-scenes",
+            type=cli.named_path,
+            metavar="DIR",
+            help="keep the .kpc files, and the .kpck files for `codec`, here",
         )
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
+    parser.add_argument("datasets", type=cli.named_path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
     parser.add_argument(
         "--preset", choices=PRESETS, default=DEFAULT_PRESET, help="preset of kpenc (default: %(default)s)"
     )

@@ -88,7 +88,7 @@ def size_text(size: tuple[int, int]) -> str:
 
 def add_scenes(parser: argparse.ArgumentParser, help: str = ".kpc files") -> None:
     """Add the positional argument SCENE..."""
-    parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=help)
+    parser.add_argument("scenes", type=cli.named_path, nargs="+", metavar="SCENE", help=help)
 
 
 def add_size(parser: argparse.ArgumentParser, default: tuple[int, int], what: str) -> None:

@@ -279,8 +279,10 @@ def _command(argv: list[str]) -> None:
         "plot", description="Draw records of kpbench curve, codec, groups, player or quality."
     )
     cli.add_version_option(parser)
-    parser.add_argument("records", type=Path, nargs="+", help="files that kpbench --out wrote")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="the .svg, .png or .pdf file to write")
+    parser.add_argument("records", type=cli.named_path, nargs="+", help="files that kpbench --out wrote")
+    parser.add_argument(
+        "-o", "--output", type=cli.named_path, required=True, help="the .svg, .png or .pdf file to write"
+    )
     options = parser.parse_args(argv)
     records = results.load(options.records)
     draw = DRAWN.get(records[0]["kind"] if records else "", curves)

@@ -81,10 +81,10 @@ def main(argv: list[str] | None = None) -> int:
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser("results", description="Write benchmark records as Markdown tables.")
     cli.add_version_option(parser)
-    parser.add_argument("records", type=Path, nargs="+", help="files that kpbench --out wrote")
+    parser.add_argument("records", type=cli.named_path, nargs="+", help="files that kpbench --out wrote")
     parser.add_argument(
         "--into",
-        type=Path,
+        type=cli.named_path,
         nargs="+",
         default=[],
         help="rewrite the tables between the markers of these documents instead of printing them",

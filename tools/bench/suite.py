@@ -71,11 +71,16 @@ def _parser() -> argparse.ArgumentParser:
         "kpbench suite", description="Measure all that kpbench can, from one commit; run again to go on."
     )
     parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the records; it is made if need be"
+        "-o",
+        "--output",
+        type=cli.named_path,
+        required=True,
+        metavar="DIR",
+        help="folder of the records; it is made if need be",
     )
     parser.add_argument(
         "--scene",
-        type=Path,
+        type=cli.named_path,
         action="append",
         default=[],
         metavar="DATASET",

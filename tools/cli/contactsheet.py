@@ -147,8 +147,10 @@ def main(argv: list[str] | None = None) -> int:
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser("contactsheet", description="Put rendered pictures beside the true ones.")
     cli.add_version_option(parser)
-    parser.add_argument("truth", type=Path, help="folder of true pictures")
-    parser.add_argument("rendered", type=Path, help="folder that kprender --cameras wrote, with or without --depth")
+    parser.add_argument("truth", type=cli.named_path, help="folder of true pictures")
+    parser.add_argument(
+        "rendered", type=cli.named_path, help="folder that kprender --cameras wrote, with or without --depth"
+    )
     parser.add_argument(
         "-o",
         "--output",

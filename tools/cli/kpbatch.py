@@ -139,7 +139,11 @@ def _parse(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
     )
     cli.add_version_option(parser)
     parser.add_argument(
-        "sources", nargs="+", metavar="JOBS.toml|SOURCE", help="a file of jobs; or folders of videos and .kpc files"
+        "sources",
+        nargs="+",
+        type=cli.file_name,
+        metavar="JOBS.toml|SOURCE",
+        help="a file of jobs; or folders of videos and .kpc files",
     )
     parser.add_argument("-o", "--output", type=cli.file_name, metavar="OUT", help="folder or address of the results")
     parser.add_argument(

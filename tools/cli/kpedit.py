@@ -79,7 +79,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_metadata_options(parser)
     parser.add_argument(
-        "--open-at", type=Path, metavar="JSON", help="open with the first view of a saved camera path or camera file"
+        "--open-at",
+        type=cli.named_path,
+        metavar="JSON",
+        help="open with the first view of a saved camera path or camera file",
     )
     parser.add_argument("--up", type=_direction, metavar="X,Y,Z", help="which direction is up in the new file")
     parser.add_argument("--metres-per-unit", type=_length, metavar="M", help="length of a unit in the new file")
@@ -90,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     provenance = parser.add_mutually_exclusive_group()
     provenance.add_argument(
         "--provenance",
-        type=Path,
+        type=cli.named_path,
         metavar="JSON",
         help="a file with members of the provenance, for scenes that do not hold their own",
     )

@@ -1,8 +1,8 @@
 """The options that all fuzzers have."""
 
 import argparse
-from pathlib import Path
 
+from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 
 
@@ -19,7 +19,7 @@ def fuzz_parser(name: str, description: str, what: str, count: int) -> argparse.
     parser.add_argument("--count", type=int, default=count, help=f"number of {what} (default: %(default)s)")
     parser.add_argument("--first", type=int, default=0, help="number of the first of them (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help=f"other {what} (default: %(default)s)")
-    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write what is found here")
+    parser.add_argument("-o", "--output", type=cli.named_path, metavar="DIR", help="write what is found here")
     return parser
 
 

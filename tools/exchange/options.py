@@ -65,12 +65,15 @@ def parser() -> argparse.ArgumentParser:
     _add_geometry(made.add_argument_group("points and meshes"))
     cameras = made.add_argument_group("cameras")
     cameras.add_argument(
-        "--scene", metavar="KPC", help="place cameras as those of this scene, by its up and its unit of length"
+        "--scene",
+        type=cli.file_name,
+        metavar="KPC",
+        help="place cameras as those of this scene, by its up and its unit of length",
     )
     cameras.add_argument(
         "--keyframes", action="store_true", help="write the keyframes of a path alone, not its smooth course"
     )
-    cameras.add_argument("--camera", metavar="NAME", help="read this camera alone")
+    cameras.add_argument("--camera", type=cli.file_name, metavar="NAME", help="read this camera alone")
     return made
 
 

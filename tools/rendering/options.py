@@ -68,18 +68,21 @@ def _add_cameras(group: argparse._ArgumentGroup) -> None:
     cameras = group.add_mutually_exclusive_group()
     cameras.add_argument(
         "--camera",
+        type=cli.file_name,
         metavar="N|NAME|JSON",
         help="a fixed camera: one of the scene's by its name or else its number from 0 on, or the one that such a "
         "file as for --cameras lists (default: the view that the file opens with, or else 0)",
     )
     cameras.add_argument(
         "--cameras",
+        type=cli.file_name,
         metavar="JSON",
         help="views to render: a file with w h fl_x fl_y cx cy frames[file time transform_matrix], or nerfstudio's "
         "transforms.json or camera_path.json",
     )
     cameras.add_argument(
         "--path",
+        type=cli.file_name,
         metavar="JSON",
         help="a smooth path through the views of such a file; a frame's `at` is its time along the path in seconds "
         "(default: 2 s apart)",
