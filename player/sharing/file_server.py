@@ -7,7 +7,7 @@ import re
 import sys
 import threading
 import time as clock
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from http import HTTPStatus
@@ -58,22 +58,39 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer a request after the delay of the link."""
+        self.answer_request(super().do_GET)
+
+    def do_HEAD(self) -> None:
+        """Answer with the headers of the whole file alone."""
+        self.answer_request(super().do_HEAD)
+
+    def answer_request(self, answer_folder: Callable[[], None]) -> None:
+        """Answer with what the path of the request names, or that there is no such file.
+
+        Args:
+            answer_folder: answers a request of a folder.
+        """
         clock.sleep(self.shared.delay_s)
-        path = Path(self.translate_path(self.path))
-        if path.is_dir():
-            super().do_GET()
-            return
         try:
-            with open(path, "rb") as file:
-                self.answer(file, os.fstat(file.fileno()))
-        except OSError:
+            path = Path(self.translate_path(self.path))
+            if path.is_dir():
+                answer_folder()
+                return
+            if not path.is_file():
+                raise FileNotFoundError
+            file = open(path, "rb")
+        except (OSError, ValueError):  # ValueError: names that no file has, such as those with null bytes
             self.send_error(HTTPStatus.NOT_FOUND)
+            return
+        with file:
+            self.answer(file, os.fstat(file.fileno()))
 
     def answer(self, file: IO[bytes], stat: os.stat_result) -> None:
-        """Send a file, or the requested range of it."""
+        """Send a file, or the requested range of it; of a request by HEAD the headers alone."""
         size, etag = stat.st_size, self.etag(stat)
         wanted = re.fullmatch(r"bytes=(\d{1,18})-(\d{0,18})", self.headers.get("Range", ""))
-        if wanted is not None and self.headers.get("If-Range", etag) == etag:
+        is_head = self.command == "HEAD"  # to which ranges do not apply
+        if not is_head and wanted is not None and self.headers.get("If-Range", etag) == etag:
             first, last = int(wanted[1]), min(int(wanted[2] or size - 1), size - 1)
             if first > last:
                 self.send_response(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE)
@@ -92,6 +109,8 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         self.send_header("ETag", etag)
         self.send_header("Last-Modified", email.utils.formatdate(stat.st_mtime, usegmt=True))
         self.end_headers()
+        if is_head:
+            return
         file.seek(first)
         self.send(file, last + 1 - first)
 

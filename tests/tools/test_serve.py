@@ -1,4 +1,5 @@
 import http.client
+import os
 import subprocess
 import sys
 import time as clock
@@ -21,10 +22,10 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "served"
 
 
-def get(url: str, path: str, **headers: str) -> tuple[http.client.HTTPResponse, bytes]:
+def get(url: str, path: str, method: str = "GET", **headers: str) -> tuple[http.client.HTTPResponse, bytes]:
     connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=10)
     try:
-        connection.request("GET", path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+        connection.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
         response = connection.getresponse()
         return response, response.read()
     finally:
@@ -67,6 +68,25 @@ def test_nothing_outside_the_folder_is_served(folder: Path) -> None:
         for path in ("/../secret", "/%2e%2e/secret", "/nothing.kpc"):
             response, body = get(url, path)
             assert response.status == 404 and b"secret" not in body.replace(b"/secret", b"")
+
+
+@pytest.mark.parametrize("method", ["GET", "HEAD"])
+def test_names_that_no_file_has_are_not_found(folder: Path, method: str, capfd: pytest.CaptureFixture[str]) -> None:
+    os.mkfifo(folder / "pipe.kpc")
+    names = ["%00", "a%00b", "a" * 5000, "%ed%b0%80", "%ff", "pipe.kpc", "%5b"]
+    with serving(folder) as url:
+        for path in [*(f"/{name}" for name in names), "x://[/../.."]:
+            assert get(url, path, method)[0].status == 404
+    assert capfd.readouterr().err == ""
+
+
+def test_head_answers_as_get_without_a_body(folder: Path) -> None:
+    with serving(folder) as url:
+        (one, body), (other, nothing) = get(url, "/scene.kpc"), get(url, "/scene.kpc", "HEAD", Range="bytes=0-9")
+    assert body == DATA and nothing == b"" and one.status == other.status == 200
+    for headers in (one.headers, other.headers):
+        del headers["Date"]
+    assert one.headers.items() == other.headers.items() and "ETag" in other.headers
 
 
 def test_a_slow_link_is_slow(folder: Path) -> None:
