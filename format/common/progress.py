@@ -1,11 +1,12 @@
-"""Progress on stderr: a bar on a terminal; elsewhere a line after a second, one as soon as the remaining time can be
-estimated, and then one every ten seconds."""
+"""Progress on stderr: a bar on a terminal that has a size; elsewhere a line after a second, one as soon as the
+remaining time can be estimated, and then one every ten seconds."""
 
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sized
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TextIO, TypeVar
 
 from tqdm import tqdm
 
@@ -14,7 +15,7 @@ from kpc.format.common.text import escaped
 
 T = TypeVar("T")
 
-# Seconds before the first lines, and between later ones, where stderr is not a terminal.
+# Seconds before the first lines, and between later ones, where there is no bar.
 FIRST_LINE_S, LINE_EVERY_S = 1.0, 10.0
 
 
@@ -50,7 +51,7 @@ class Progress:
         # before it caches are filled. The time of compiling kernels never counts.
         self.first: tuple[float, float] | None = None
         self.bar: _Bar | None = None
-        if shown and sys.stderr.isatty():
+        if shown and _fits_a_bar(sys.stderr):
             count = "" if unit == "%" else " {n:.0f}/{total:.0f}"  # the bar begins with the percentage
             layout = f"{{l_bar}}{{bar}}|{count} [{{elapsed}}<{{left}}]{{postfix}}" if total else None
             self.bar = _Bar(
@@ -110,6 +111,16 @@ class Progress:
             return None
         done, when = self.first
         return (working_s() - when) * (self.total - self.done) / (self.done - done)
+
+
+def _fits_a_bar(stream: TextIO) -> bool:
+    """Return whether a stream is a terminal that has a size: on one of no columns, tqdm shows nothing."""
+    if not stream.isatty():
+        return False
+    try:
+        return os.get_terminal_size(stream.fileno()).columns > 0
+    except OSError:  # it stands for a terminal, without a file
+        return True
 
 
 def progress(

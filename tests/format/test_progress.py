@@ -1,7 +1,9 @@
 """A bar on a terminal, lines elsewhere, nothing if hidden."""
 
 import io
+import os
 import re
+import struct
 import sys
 
 import pytest
@@ -111,3 +113,23 @@ def test_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, total: int | None) -
         bar.advance(2)  # one more than the total
         bar.bar.refresh()
     assert "decode" in terminal.getvalue() and "psnr 30" in terminal.getvalue() and "4" in terminal.getvalue()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no pseudoterminals")
+@pytest.mark.parametrize("columns", [0, 80])
+def test_a_terminal_without_a_size_gets_lines(clock: Clock, monkeypatch: pytest.MonkeyPatch, columns: int) -> None:
+    import fcntl
+    import termios
+
+    reader, writer = os.openpty()
+    fcntl.ioctl(writer, termios.TIOCSWINSZ, struct.pack("HHHH", columns // 4, columns, 0, 0))
+    with open(writer, "w") as terminal:
+        monkeypatch.setattr(sys, "stderr", terminal)
+        with Progress("decode", 100, "frame") as bar:
+            clock.now = 2.0
+            bar.advance(7)
+        terminal.flush()
+        shown = os.read(reader, 10_000).decode()
+    os.close(reader)
+    assert ("\r" in shown.replace("\r\n", "")) == (columns > 0)
+    assert columns > 0 or shown == "decode: 7/100 frame\r\n"
