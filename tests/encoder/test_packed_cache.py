@@ -280,11 +280,11 @@ def test_a_lock_is_waited_for_and_taken_over(tmp_path: Path, monkeypatch: pytest
     words, said = [sys.executable, "-c", code, str(tmp_path / "x.lock")], []
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as owner:
 
-        def end(text: str, **_: object) -> None:
+        def end(text: str) -> None:
             said.append(text)
             owner.kill()
 
-        monkeypatch.setattr(cache_lock, "print", end, raising=False)
+        monkeypatch.setattr(cache_lock, "notice", end)
         assert owner.stdout is not None and owner.stdout.readline()
         with cache_lock.exclusive(tmp_path / "x.lock"):
             assert owner.wait() != 0
