@@ -201,3 +201,33 @@ def test_usd_that_cannot_be_written_is_one_line(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(usd_cameras, "atomic_write", lambda path: contextlib.nullcontext(aside))
     with pytest.raises(MediaError, match=r"out\.usda: cannot be written \(.+\)$"):
         usd_cameras.write_usd_cameras(tmp_path / "out.usda", [], 24.0)
+
+
+OWN, SCENES, PATHS = "is not for a scene's own cameras", "is for scenes", "is for paths, and "
+
+
+@pytest.mark.parametrize(
+    ("source", "output", "words", "reason"),
+    [
+        ("s.kpc", "x.gltf", ["--time", "0"], OWN),
+        ("s.kpc", "x.gltf", ["--from", "0"], OWN),
+        ("s.kpc", "x.gltf", ["--step", "2"], OWN),
+        ("s.kpc", "x.gltf", ["--backend", "gl"], OWN),
+        ("s.kpc", "x.gltf", ["--quality", "reference"], OWN),
+        ("in.json", "x.gltf", ["--step", "1"], SCENES),
+        ("in.json", "x.gltf", ["--appearance", "a"], SCENES),
+        ("x.glb", "out.json", ["--quality", "balanced"], SCENES),
+        ("s.kpc", "x.glb", ["--mesh", "--quality", "balanced"], "is for points"),
+        ("s.kpc", "x.glb", ["--mesh", "--backend", "reference"], "is for points"),
+        ("in.json", "x.gltf", ["--keyframes"], PATHS),
+        ("in.json", "x.gltf", ["--fps", "8"], "is for the smooth course of a path"),
+    ],
+)
+def test_options_that_change_nothing_are_refused(
+    tmp_path: Path, source: str, output: str, words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_views(tmp_path / "in.json", views(False))
+    assert kpexport.main([str(tmp_path / source), "-o", str(tmp_path / output), *words]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    option = next(word for word in reversed(words) if word.startswith("--"))
+    assert said.startswith(f"kpexport: {option} {reason}") and said.endswith("; leave it out")

@@ -39,7 +39,16 @@ from kpc.tools.exchange.camera_tracks import Track, load_tracks, placed, views_o
 from kpc.tools.exchange.field import Done
 from kpc.tools.exchange.geometry_files import write_geometry
 from kpc.tools.exchange.mesh import Mesh, surface_mesh
-from kpc.tools.exchange.options import DENSITY, PATH_FPS, RESOLUTION, SPACING_PARTS, USD_SUFFIXES, Task, parser, task_of
+from kpc.tools.exchange.options import (
+    DENSITY,
+    PATH_FPS,
+    RESOLUTION,
+    SPACING_PARTS,
+    USD_SUFFIXES,
+    Task,
+    check_path,
+    parse,
+)
 from kpc.tools.exchange.placement import Placement
 from kpc.tools.exchange.points import MAX_CELLS, Cloud, is_clipped, normals_of, surface_points
 from kpc.tools.rendering.claims import claimed
@@ -54,8 +63,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    options = parser().parse_args(argv)
-    task = task_of(options)
+    options, task = parse(argv)
     cli.check_writable(Path(options.output), is_folder=task.is_folder)
     if task.kind == "geometry":
         _export_geometry(task, options)
@@ -185,6 +193,7 @@ def _exchange_cameras(task: Task, options: argparse.Namespace) -> None:
     if task.kind == "to":
         fps = float(options.fps or PATH_FPS)
         tracks = placed(load_tracks(source, None if options.keyframes else fps), placement)
+        check_path(options, task, tracks[0].is_moving)
         _write_cameras(task, output, tracks, fps)
         return
     is_usd = source.suffix.lower() in USD_SUFFIXES

@@ -21,8 +21,13 @@ SPACING_PARTS = 400
 # Instants per second of a path, if nothing is said.
 PATH_FPS = 24.0
 # Options for scenes alone, and for cameras alone.
-_OF_SCENES = ("time", "start_s", "end_s", "frames", "mesh", "resolution", "density", "spacing", "normals", "format")
+_OF_SCENES = ("time", "start_s", "end_s", "frames", "step", "mesh", "resolution", "density", "spacing", "normals",
+              "format", "backend", "quality", "appearance")  # fmt: skip
 _OF_CAMERAS = ("keyframes", "camera", "scene")
+_OF_POINTS = ("spacing", "normals", "size", "backend", "quality", "appearance")
+_OF_MESHES = ("resolution", "density")
+# Options with a default of the parser: whether they are given is not seen by their values.
+_WITH_DEFAULT = ("step", "backend", "quality")
 _FLAGS = {"start_s": "--from", "end_s": "--to"}
 
 
@@ -105,15 +110,30 @@ def _add_geometry(group: argparse._ArgumentGroup) -> None:
         help="points: size of the pictures of each of the scene's cameras that they are taken from; cameras that are "
         "read: size of their pictures",
     )  # fmt: skip
-    group.add_argument("--backend", choices=("gl", "reference"), default="gl", help="as of kprender: what renders them")
+    group.add_argument("--backend", choices=("gl", "reference"), default="gl", help="points: as of kprender")
     group.add_argument(
-        "--quality", choices=tuple(LEVELS), default="reference", help="as of kprender (default: %(default)s)"
+        "--quality", choices=tuple(LEVELS), default="reference", help="points: as of kprender (default: %(default)s)"
     )
     group.add_argument("--appearance", metavar="NAME|A:B:0.3", help="points: as of kprender")
 
 
-def task_of(options: argparse.Namespace) -> Task:
-    """Return what the names of input and output ask for.
+def parse(argv: list[str]) -> tuple[argparse.Namespace, Task]:
+    """Return the options of a command line, and what they ask for.
+
+    Raises:
+        UsageError: nothing of that kind can be written, or an option does not apply to it.
+    """
+    made = parser()
+    options = made.parse_args(argv, argparse.Namespace(**dict.fromkeys(_WITH_DEFAULT)))
+    task = _task_of(options)
+    for name in _WITH_DEFAULT:
+        if getattr(options, name) is None:
+            setattr(options, name, made.get_default(name))
+    return options, task
+
+
+def _task_of(options: argparse.Namespace) -> Task:
+    """Return what the names of input and output ask for; options that are not given are None or False.
 
     Raises:
         UsageError: nothing of that kind can be written, or an option does not apply to it.
@@ -127,19 +147,19 @@ def task_of(options: argparse.Namespace) -> Task:
                 "give such a name"
             )
         _refuse(options, _OF_SCENES, "is for scenes")
-        if options.step != 1:
-            raise UsageError("--step is for scenes; leave it out")
         if source == ".json":
             _refuse(options, ("camera", "size"), "is for cameras that are read from other files")
         else:
             _refuse(options, ("keyframes", "fps"), "is for paths that are written")
         return Task("to" if source == ".json" else "from", False, suffix)
     if suffix in CAMERA_SUFFIXES and not options.output.endswith("/"):
-        _refuse(options, (*_OF_SCENES, *_OF_CAMERAS, "fps", "size", "appearance"), "is not for a scene's own cameras")
+        _refuse(options, (*_OF_SCENES, *_OF_CAMERAS, "fps", "size"), "is not for a scene's own cameras")
         return Task("cameras", False, suffix)
     _refuse(options, _OF_CAMERAS, "is for cameras")
-    _refuse(options, ("spacing", "normals", "size", "appearance") if options.mesh else ("resolution", "density"),
-            "is for points" if options.mesh else "is for --mesh")  # fmt: skip
+    if options.mesh:
+        _refuse(options, _OF_POINTS, "is for points")
+    else:
+        _refuse(options, _OF_MESHES, "is for --mesh")
     if (
         not suffix
         or options.output.endswith("/")
@@ -156,7 +176,25 @@ def task_of(options: argparse.Namespace) -> Task:
     return Task("geometry", False, suffix)
 
 
+def check_path(options: argparse.Namespace, task: Task, is_path: bool) -> None:
+    """Refuse options of paths that change nothing in what is written of a camera file.
+
+    Args:
+        options: of the command line.
+        task: of kind "to".
+        is_path: whether the file is a path.
+
+    Raises:
+        UsageError: there is one.
+    """
+    if not is_path:
+        _refuse(options, ("keyframes",), f"is for paths, and {options.input} is none")
+    if task.suffix in GLTF_SUFFIXES and (options.keyframes or not is_path):  # USD has a rate of its own
+        _refuse(options, ("fps",), "is for the smooth course of a path")
+
+
 def _refuse(options: argparse.Namespace, names: tuple[str, ...], reason: str) -> None:
     for name in names:
-        if getattr(options, name) not in (None, False):
+        value = getattr(options, name)
+        if value is not None and value is not False:  # 0 is given
             raise UsageError(f"{_FLAGS.get(name, f'--{name}')} {reason}; leave it out")
