@@ -185,12 +185,25 @@ def test_verify_lists_every_damaged_chunk(scene_file, capsys):
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert f"{scene_file}: 2 chunks are damaged: 1 (DECO), 6 (PLNE); fetch the file again" in error
-    assert kpinfo.main([str(scene_file)]) == 1
-    capsys.readouterr()
     assert kpinfo.main([str(scene_file), "--verify", "--json"]) == 1
     (info,) = json_of(capsys)["files"]
     assert [(one["chunk"], one["kind"]) for one in info["damaged_chunks"]] == [(1, "DECO"), (6, "PLNE")]
     assert not info["verified"] and "2 chunks are damaged" in info["error"] and info["clip"]["frame_count"] == 11
+
+
+@pytest.mark.parametrize("chunk", [1, 6])  # DECO, PLNE
+def test_a_damaged_chunk_is_reported_in_every_form(scene_file, tmp_path, capsys, chunk):
+    whole = tmp_path / "whole.kpc"
+    data = bytearray(scene_file.read_bytes())
+    whole.write_bytes(data)
+    data[Reader(bytes(data)).index[chunk].offset + 3] ^= 0x10
+    scene_file.write_bytes(data)
+    for files in ([scene_file], [scene_file, whole]):
+        for options in ([], ["--json"], ["--verify"]):
+            assert kpinfo.main([*map(str, files), *options]) == 1
+            printed, said = capsys.readouterr()
+            assert f"kpinfo: {scene_file}: chunk {chunk} " in said
+            assert ("(damaged)" in printed) == (len(files) > 1 and "--json" not in options)
 
 
 def test_a_file_whose_end_is_missing_is_described_but_not_verified(scene_file, capsys):

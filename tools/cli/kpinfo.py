@@ -8,7 +8,8 @@
     kpinfo scene.kpc --verify    also check all checksums and decode everything
 
 The exit code is 1 if any file is damaged or cannot be read. Without --verify, a file whose end is missing is described
-as far as it goes, and of several files only what the table shows is read, so that damage to the rest is not noticed.
+as far as it goes, and of a clip in groups only what describes the groups is read, so that damage to the rest is not
+noticed.
 """
 
 import argparse

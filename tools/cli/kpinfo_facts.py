@@ -42,7 +42,7 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
         memory: bytes that one group may take.
         group: number of the group of which the scene is described; None: that of a file without groups.
         verify: whether to check all checksums and decode everything, or the one group.
-        details: whether to describe the scene, which takes decoding it.
+        details: whether to describe the scene.
 
     Raises:
         UsageError: there is no such group.
@@ -75,10 +75,10 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
         info |= {"cameras": len(groups.cameras()), "metadata": dict(groups.metadata().document)}
         if verify:
             _verify(groups, range(len(groups)) if group is None else [group], info)
-        if details and (group is not None or groups.is_single):
+        if (details or not verify) and (group is not None or groups.is_single):
             reader = groups.open(group or 0)
-            described = describe(reader, read(reader, memory_budget=memory, allow_partial=True))
-            info["groups"][group or 0]["scene"] = described
+            scene = read(reader, memory_budget=memory, allow_partial=True)  # without details, too, to notice damage
+            info["groups"][group or 0]["scene"] = describe(reader, scene) if details else None
     except UsageError:
         raise
     except (KpcError, OSError) as error:
