@@ -388,6 +388,8 @@ def _check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         parser.error("-o names the file to write; give for example -o scene.kpc")
     if given.source.suffix.lower() in (".kpc", ".kpck") and not given.source.exists():
         parser.error(f"{given.source}: no such file")
+    if given.source.is_fifo():
+        parser.error(f"{given.source}: is a pipe, and sources are read in any order; save it to a file")
     if given.source.is_file():
         for name, value in vars(given).items():
             if name not in TRANSCODE_OPTIONS and value != parser.get_default(name):

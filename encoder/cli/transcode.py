@@ -16,7 +16,6 @@ from kpc.format.common.errors import UsageError
 from kpc.format.common.text import notice
 from kpc.format.common.version import VERSION
 from kpc.format.container import groups, rewriting, scene_io
-from kpc.format.container.container import MAGIC
 from kpc.format.container.metadata_options import with_view_limits
 from kpc.format.container.rewriting import with_metadata
 from kpc.format.scene.metadata import HISTORY_LIMIT, Metadata
@@ -37,12 +36,8 @@ def transcode(options: Options) -> dict[str, Any]:
     """
     started = time.monotonic()
     check_outputs(options)
-    is_coded = codec_model.starts_with(options.source, MAGIC)
-    if is_coded and options.trade.psnr_db is not None:
-        raise UsageError(
-            f"--psnr: {options.source} holds no filmed pictures to compare with; give its checkpoint, or --quality"
-        )
-    if is_coded and not (clip := groups.Groups(options.source)).is_single:
+    clip = open_source(options)
+    if clip is not None and not clip.is_single:
         return _transcode_groups(options, clip) | {"encode_s": time.monotonic() - started}
     source = replace(codec_model.load(options.source), shown=True)
     before, metadata = source.scene.metadata, _with_history(source.scene.metadata, options)
@@ -59,9 +54,25 @@ def transcode(options: Options) -> dict[str, Any]:
     size = rewriting.save(data, options.output)
     return {
         "file": str(options.output), "source": str(options.source), "is_copy": is_copy,
-        **coding_figures(coded, size, options.trade, EVALUATED_ON[is_coded]),
+        **coding_figures(coded, size, options.trade, EVALUATED_ON[clip is not None]),
         "encode_s": time.monotonic() - started,
     }  # fmt: skip
+
+
+def open_source(options: Options) -> groups.Groups | None:
+    """Open the file that is to be coded anew, of which little is read; None if it is a checkpoint.
+
+    Raises:
+        UsageError: it is neither a .kpc file nor a checkpoint, or the options do not apply to it.
+        FormatError: it cannot be read, or its end is missing.
+    """
+    if not codec_model.is_coded(options.source):
+        return None
+    if options.trade.psnr_db is not None:
+        raise UsageError(
+            f"--psnr: {options.source} holds no filmed pictures to compare with; give its checkpoint, or --quality"
+        )
+    return groups.Groups(options.source)
 
 
 def _with_history(metadata: Metadata, options: Options) -> Metadata:

@@ -365,10 +365,19 @@ def load(path: Path) -> Model:
         TrainingError: the checkpoint cannot be used.
         FormatError: the file cannot be read.
     """
+    return model_from_file(scene_io.read(path)) if is_coded(path) else load_checkpoint(path)
+
+
+def is_coded(path: Path) -> bool:
+    """Return whether a file is a .kpc file, by its first bytes; False for a checkpoint.
+
+    Raises:
+        UsageError: it is neither.
+    """
     if starts_with(path, MAGIC):
-        return model_from_file(scene_io.read(path))
+        return True
     if starts_with(path, CHECKPOINT_MAGIC):
-        return load_checkpoint(path)
+        return False
     raise UsageError(f"{path}: neither a folder of videos or images, nor a finished checkpoint, nor a .kpc file")
 
 

@@ -219,6 +219,21 @@ def test_an_empty_folder_is_refused_before_anything_starts(tmp_path: Path, capsy
     assert "empty directory" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
+def test_files_that_cannot_be_coded_are_refused_before_anything_starts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sample = SAMPLE.read_bytes()
+    (tmp_path / "none.kpc").touch()
+    (tmp_path / "cut.kpc").write_bytes(sample[:-1])
+    (tmp_path / "whole.kpc").write_bytes(sample)
+    os.mkfifo(tmp_path / "pipe.kpc")
+    names = [str(tmp_path / f"{name}.kpc") for name in ("none", "cut", "whole", "pipe")]
+    assert main([*names, "-o", str(tmp_path / "out"), "--dry-run"]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert [line.split(": ")[1] for line in said] == [names[0], names[1], names[3]]
+    assert "nor a .kpc file" in said[0] and "cut off at" in said[1] and "is a pipe" in said[2]
+
+
 def test_an_address_follows_content_options_and_group(take: Path) -> None:
     def keys(options: tuple[str, ...]) -> list[str]:
         source_address.cache_clear()
@@ -532,7 +547,9 @@ def test_changed_files_of_a_work_folder_reach_the_store(tmp_path: Path) -> None:
 
 def test_failures_are_listed_and_what_is_done_is_published(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     broken, out = tmp_path / "broken.kpc", tmp_path / "out"
-    broken.write_bytes(SAMPLE.read_bytes()[:1000])
+    data = bytearray(SAMPLE.read_bytes())
+    data[20_000] ^= 1
+    broken.write_bytes(data)
     options = ["--quality", "20"]
     (done,) = first_tasks(jobs.jobs_of_folders([str(SAMPLE)], options, Resources()))
     store = Store(f"{out}/.kpbatch")
@@ -540,9 +557,7 @@ def test_failures_are_listed_and_what_is_done_is_published(tmp_path: Path, capsy
     store.put_json({"size_bytes": 57_243, "test_psnr": 33.7}, f"{done.key}/{RESULT}")
     assert main([str(SAMPLE), str(broken), "-o", str(out), "--workers", "1", "--", *options]) == 1
     said = capsys.readouterr()
-    assert (
-        re.search(r"broken failed:\n.*broken.kpc: cut off at 1,000 of", said.out) and "1 of 2 jobs failed" in said.err
-    )
+    assert re.search(r"broken failed:\n.*broken.kpc: chunk 11 ", said.out) and "1 of 2 jobs failed" in said.err
     assert re.search(r"^default +57,243 +33.70 ", said.out, re.MULTILINE)
     assert (out / "default.kpc").read_bytes() == SAMPLE.read_bytes()
     assert json.loads((out / "default.json").read_text())["key"] == done.key

@@ -269,10 +269,12 @@ def _resources(given: Mapping[str, Any], where: str, faults: Faults) -> Resource
 
 
 def _checked(job: Job, faults: Faults) -> Job:
-    """Check a job's options by kpenc's own parser, and that a folder on this machine holds something to encode; return
-    the job with what they say about groups."""
+    """Check a job's options by kpenc's own parser, and that a source on this machine is a folder that holds something
+    to encode, or a file that begins and ends as those that are coded anew; return the job with what the options say
+    about groups."""
     from kpc.encoder.cli import options as kpenc  # loads PyTorch, which workers need not
     from kpc.encoder.cli.read_dataset import check_folder
+    from kpc.encoder.cli.transcode import open_source
 
     if ADDRESS.match(job.source) and job.source.endswith(".kpc"):
         return job  # its options are checked once the file is there
@@ -285,14 +287,14 @@ def _checked(job: Job, faults: Faults) -> Job:
         given = [name for name in REFUSED_FIELDS if getattr(options, name) != getattr(plain, name)]
         for name in given + ["dry_run"] * is_plan + ["json"] * is_json:
             faults.add(job.where, f"--{name.replace('_', '-')}: {A_BATCHS_OWN}")
-        if not ADDRESS.match(job.source) and options.source.is_dir():
-            check_folder(options)
+        if not ADDRESS.match(job.source):
+            open_source(options) if options.source.is_file() else check_folder(options)
         return replace(job, group=options.group_s is not None)
     except SystemExit as stop:
         message = said.getvalue().strip().rsplit("error: ", 1)[-1]
         faults.add(job.where, message if stop.code else f"--help and --version: {A_BATCHS_OWN}")
-    except KpcError as error:
-        faults.add(job.where, str(error))
+    except (KpcError, OSError) as error:
+        faults.add(job.where, cli.message_of(error) or str(error))
     return job
 
 
