@@ -276,6 +276,15 @@ def test_groups_are_placed_retimed_and_cut(clip, capsys):
     assert "held_out" not in opened.metadata().provenance
 
 
+def test_only_planes_that_are_coded_anew_are_said_to_be_larger(clip, capsys):
+    """Groups that are kept whole are larger by their metadata alone, a part of one by its planes, too."""
+    for source, is_coded_anew in ((clip, False), (clip.with_name("one.kpc"), True)):
+        out = clip.with_name("out.kpc")
+        assert kpedit.main([str(source), "-o", str(out), "--from", "0.4s", "--description", "d" * 300]) == 0
+        assert out.stat().st_size > source.stat().st_size
+        assert ("predicted from less" in capsys.readouterr().err) == is_coded_anew
+
+
 def test_clips_of_different_rates_are_joined_when_told_to(tmp_path, capsys):
     write(quantised(), tmp_path / "slow.kpc")
     write(at_rate(quantised(), 30.0), tmp_path / "fast.kpc")

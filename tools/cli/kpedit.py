@@ -63,7 +63,8 @@ def _command(argv: list[str]) -> None:
         size, kept_s = save(with_metadata(options.scene, metadata), options.output), None
     else:
         size, kept_s = edit(options.scene, options.output, edits, metadata)
-    if (kept_s is not None or options.box is not None) and size > options.scene.stat().st_size:
+    is_part = kept_s is not None or options.box is not None
+    if is_part and size > options.scene.stat().st_size and _plane_bytes(Groups(options.output)) > _plane_bytes(groups):
         notice(
             "kpedit: larger than the source, since texels are predicted from less; kpenc makes it smaller, at a loss"
         )
@@ -128,6 +129,12 @@ def _add_edits(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fps", type=cli.frame_rate(MIN_FPS, MAX_FPS), metavar="F", help="frames per second, at the same length"
     )
+
+
+def _plane_bytes(clip: Groups) -> int:
+    """Return the bytes of the chunks that hold texels."""
+    indices = [clip.open(number).index for number in range(len(clip))]
+    return sum(entry.stored_length for index in indices for entry in index if entry.kind == "PLNE")
 
 
 def _changed_time(options: argparse.Namespace, kept_s: tuple[float, float] | None) -> str:
