@@ -9,6 +9,7 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.datasets.dataset import Dataset
+from kpc.format.common.text import counted
 
 # Pictures that are looked at, evenly spread over all of them, and rows of each.
 PICTURES, ROWS = 256, 8
@@ -164,7 +165,7 @@ def _cameras(dataset: Dataset) -> Iterator[str]:
     outside = ((p.intrinsics[:, 2:] < 0) | (p.intrinsics[:, 2:] > size)).any(axis=1)
     if outside.any():
         names = first_names(list(dict.fromkeys(p.file[n] for n in np.flatnonzero(outside))))
-        yield f"the principal point lies outside of {int(outside.sum())} pictures: {names}; check cx and cy"
+        yield f"the principal point lies outside of {counted(int(outside.sum()), 'picture')}: {names}; check cx and cy"
     known = np.isfinite(p.near) & np.isfinite(p.far)
     if (np.isfinite(p.near) | np.isfinite(p.far)).any() and not known.all():
         yield (

@@ -13,6 +13,7 @@ from av.video.stream import VideoStream
 
 from kpc.encoder.datasets.containers import open_container
 from kpc.format.common.errors import MediaError
+from kpc.format.common.text import counted
 
 # Containers whose time line begins at 0, by libav's names. The clocks of others start anywhere.
 MP4, MATROSKA, AVI, MPEG_TS = "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts"
@@ -97,7 +98,8 @@ def read_time_stamps(
         return TimeStamps(shown[~lead] * float(tick), fps, True, packets.missing + int(lead.sum()), ())
     notes = []
     if lead.any():
-        notes.append(f"the first {lead.sum()} frames cannot be decoded without what came before; left out")
+        first = counted(int(lead.sum()), "frame")
+        notes.append(f"the first {first} cannot be decoded without what came before; left out")
     if packets.before_start:
         notes.append(f"{packets.before_start} frames before its time line starts are not shown; left out")
     if len(shown) < len(pts) and stream.codec_context.name not in HIDES_FRAMES:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from kpc.format.common.images import write_image
+from kpc.format.common.text import counted
 from kpc.format.container.http_address import is_url
 from kpc.format.container.sources import open_source
 from kpc.player.app.camera_paths import CameraPath
@@ -274,7 +275,7 @@ class Actions:
         (path, file), self._path_to_load, state = self._path_to_load, None, self.state
         state.follower.replace(path)
         state.visible.path = True
-        state.notify(f"loaded {len(path.keyframes)} keyframes from {file}; press J to follow them")
+        state.notify(f"loaded {counted(len(path.keyframes), 'keyframe')} from {file}; press J to follow them")
 
     @property
     def asks(self) -> bool:

@@ -29,7 +29,7 @@ def test_truth_rendered_and_depth_stand_side_by_side(tmp_path: Path, capsys: pyt
     assert contactsheet.main([str(truth), str(rendered), "-o", str(out), "--rows", "2"]) == 0
     printed = capsys.readouterr()
     assert printed.out == f"{out}: mean PSNR 28.13 dB over 3 pictures\n"  # 20 log10(255 / 10)
-    assert printed.err == f"contactsheet: {rendered / 'z.png'} and 1 others: no partner of that name, left out\n"
+    assert printed.err == f"contactsheet: {rendered / 'z.png'} and 1 other: no partner of that name, left out\n"
     page, gap, step = read_image(out), contactsheet.GAP, 40 + contactsheet.CAPTION
     assert page.shape == (2 * step + gap, gap + 3 * (60 + gap), 3)
     for row in (gap, gap + step):

@@ -127,6 +127,13 @@ def test_files_are_what_their_names_say(run, scene_file: Path, tmp_path: Path, n
     assert (tmp_path / name).read_bytes().startswith(beginning)
 
 
+def test_one_picture_of_another_name_is_spoken_of_as_one(run, scene_file: Path, tmp_path: Path) -> None:
+    listed = cameras_json(tmp_path / "cameras.json", ["a.png", ".b.png"])
+    words = ["--cameras", listed, "--size", "8x6", "--backend", "reference", "-o", tmp_path / "out"]
+    code, _, notes = run(scene_file, *words)
+    assert code == 0 and "1 picture gets another name, for its own is taken or no plain file name\n" in notes
+
+
 def test_names_and_poses_of_nerfstudio(run, scene_file: Path, tmp_path: Path) -> None:
     """Frames keep the names of `file_path`, also one without a suffix; none keeps a name that is there twice."""
     listed = cameras_json(tmp_path / "transforms.json", ["images/0007.png", "./train/r_0.5", "b/0007.png"])

@@ -17,7 +17,7 @@ from kpc.format.common.errors import MediaError, UsageError
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.images import read_image, write_image
 from kpc.format.common.media_files import is_image
-from kpc.format.common.text import escaped, notice
+from kpc.format.common.text import counted, escaped, notice
 from kpc.tools.cli.depth_images import NO_SURFACE, read_depth_levels
 
 # Space between pictures, and height of a caption, in pixels.
@@ -173,13 +173,13 @@ def _command(argv: list[str]) -> None:
         raise UsageError(f"--rows {options.rows} is not positive")
     found, alone = pairs(options.truth, options.rendered)
     if alone:
-        others = f" and {len(alone) - 1} others" if len(alone) > 1 else ""
+        others = f" and {counted(len(alone) - 1, 'other')}" if len(alone) > 1 else ""
         notice(f"contactsheet: {alone[0]}{others}: no partner of that name, left out")
     quality = {pair.name: pair.psnr for pair in found}
     chosen = sorted({round(k) for k in np.linspace(0, len(found) - 1, min(options.rows, len(found)))})
     write_image(options.output, sheet([found[k] for k in chosen], quality))
     mean = np.mean(list(quality.values()))
-    print(escaped(f"{options.output}: mean PSNR {mean:.2f} dB over {len(found)} pictures"))
+    print(escaped(f"{options.output}: mean PSNR {mean:.2f} dB over {counted(len(found), 'picture')}"))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
-from kpc.format.common.text import escaped, notice
+from kpc.format.common.text import counted, escaped, notice
 from kpc.tools.batch.jobs import (
     ADDRESS,
     Batch,
@@ -68,7 +68,9 @@ def _command(argv: list[str]) -> None:
     print_summary(batch.jobs, ended, options.json)
     write_report(batch.jobs, ended, output)
     if failed:
-        raise BatchError(f"{failed} of {len(batch.jobs)} jobs failed; run the same command to try them again")
+        raise BatchError(
+            f"{failed} of {counted(len(batch.jobs), 'job')} failed; run the same command to try them again"
+        )
 
 
 def _run(

@@ -105,9 +105,9 @@ def _export_geometry(task: Task, options: argparse.Namespace) -> None:
             path = output / f"{shots.name(number)}{task.suffix}" if task.is_folder else output
             write_geometry(path, shape, placement)
             count += len(shape.points)
-    what = "vertices" if options.mesh else "points"
-    files = f"{len(shots)} file{'s' * (len(shots) != 1)}, " if task.is_folder else ""
-    print(escaped(f"{output}: {files}{count:,} {what}, in {clock.monotonic() - started:.1f} s"))
+    what = counted(count, "point") if not options.mesh else f"{count:,} {'vertex' if count == 1 else 'vertices'}"
+    files = f"{counted(len(shots), 'file')}, " if task.is_folder else ""
+    print(escaped(f"{output}: {files}{what}, in {clock.monotonic() - started:.1f} s"))
 
 
 def _say_where(placement: Placement, metadata: Metadata) -> None:
@@ -214,7 +214,7 @@ def _write_cameras(task: Task, output: Path, tracks: list[Track], fps: float) ->
         for note in gltf_cameras.write_gltf_cameras(output, tracks):
             _say(note)
     count = sum(len(track.views) for track in tracks)
-    what = f"a path of {count} instants" if tracks[0].is_moving else f"{count} camera{'s' * (count != 1)}"
+    what = f"a path of {counted(count, 'instant')}" if tracks[0].is_moving else f"{counted(count, 'camera')}"
     print(escaped(f"{output}: {what}"))
 
 

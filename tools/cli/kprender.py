@@ -182,7 +182,9 @@ def _write_pictures(
         unit = pictures.depth_unit(scene, [shots.camera(number) for number in shots.numbers])
     paths, renamed = output.picture_paths([shots.name(number) for number in shots.numbers])
     if renamed:
-        _say(f"{options.cameras}: {renamed} pictures get other names, for theirs are taken or no plain file names")
+        one, more = "gets another name, for its own is", "get other names, for theirs are"
+        what = f"{one} taken or no plain file name" if renamed == 1 else f"{more} taken or no plain file names"
+        _say(f"{options.cameras}: {counted(renamed, 'picture')} {what}")
     wanted = list(zip(shots.numbers, paths, strict=True))
     with contextlib.ExitStack() as alone:
         if output.is_folder:
