@@ -98,8 +98,8 @@ def read_time_stamps(
         return TimeStamps(shown[~lead] * float(tick), fps, True, packets.missing + int(lead.sum()), ())
     notes = []
     if lead.any():
-        first = counted(int(lead.sum()), "frame")
-        notes.append(f"the first {first} cannot be decoded without what came before; left out")
+        unseen = counted(int(lead.sum()), "frame")
+        notes.append(f"the first {unseen} cannot be decoded without what came before; left out")
     if packets.before_start:
         notes.append(f"{packets.before_start} frames before its time line starts are not shown; left out")
     if len(shown) < len(pts) and stream.codec_context.name not in HIDES_FRAMES:
