@@ -77,7 +77,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
 
 
 def _check_size(options: Options, setting: Setting, trainer: Trainer) -> None:
-    """Refuse before training a target size that is less than what training and coding leave as it is.
+    """Refuse before training a target size that is less than what neither training nor coding changes.
 
     How small the smallest file of a model is depends on its decoder, so it is known only once it is trained.
 

@@ -82,7 +82,7 @@ def initialise_from(field: Field, before: Scene) -> None:
     """Initialise a field from the end of a scene of the same layout, but for its rows in time.
 
     Space planes and decoder are copied; time planes and motion take the scene's last row at all times. Appearance
-    embeddings are copied where there are as many. Of the scene, only what the field holds is taken.
+    embeddings are copied where there are as many. What the field leaves out of the scene is not copied.
     """
     earlier = Field.from_scene(before)
     with torch.no_grad():

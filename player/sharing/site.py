@@ -186,7 +186,7 @@ def own_files(folder: Path, wanted: Mapping[str, Path | bytes]) -> dict[str, Pat
     nor a copy of one.
 
     Args:
-        folder: that is to be written, as it is before.
+        folder: that is to be written, and is not yet.
         wanted: what is to be written, by names: files of the user as paths, all else as bytes.
     """
     page = folder / PAGE

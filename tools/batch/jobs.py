@@ -288,7 +288,8 @@ def _checked(job: Job, faults: Faults) -> Job:
         for name in given + ["dry_run"] * is_plan + ["json"] * is_json:
             faults.add(job.where, f"--{name.replace('_', '-')}: {A_BATCHS_OWN}")
         if not ADDRESS.match(job.source):
-            open_source(options) if options.source.is_file() else check_folder(options)
+            check = open_source if options.source.is_file() else check_folder
+            check(options)
         return replace(job, group=options.group_s is not None)
     except SystemExit as stop:
         message = said.getvalue().strip().rsplit("error: ", 1)[-1]
