@@ -11,12 +11,12 @@ export class ClipScenes {
 
   constructor(readonly renderer: Renderer) {}
 
-  /** Take what has arrived of scenes that are shown or will be; return whether there was anything. */
+  /** Take what has arrived of scenes that are shown or will be; return whether to go on: there was some, or may be. */
   take(clip: Clip): boolean {
     const drawn = clip.scenes.map((scene) => this.#drawn(scene));
     const before = drawn.map(({ version }) => version);
-    for (const scene of drawn) this.renderer.upload(scene);
-    return drawn.some(({ version }, i) => version !== before[i]);
+    const areAnswered = drawn.map((scene) => this.renderer.upload(scene));
+    return areAnswered.includes(false) || drawn.some(({ version }, i) => version !== before[i]);
   }
 
   /** Return what makes the picture at a time. */

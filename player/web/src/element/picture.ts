@@ -61,7 +61,7 @@ export class Picture {
     this.#renderer.present(); // stretched, until there is one of that size
   }
 
-  /** Take what has arrived of scenes that are shown or will be; return whether there was anything. */
+  /** Take what has arrived of scenes that are shown or will be; return whether to go on: there was some, or may be. */
   take(clip: Clip): boolean {
     return this.#scenes.take(clip);
   }

@@ -251,7 +251,7 @@ export class Session {
     const seconds = this.#lastFrame === 0 ? 0 : (now - this.#lastFrame) / 1000;
     this.#input.advance(seconds);
     const isMoving = view.advance(seconds) || this.#input.isActive;
-    const hasTaken = this.#attempt(() => this.#picture?.take(clip)) ?? false; // a group may be shown thereafter
+    const isTaking = this.#attempt(() => this.#picture?.take(clip)) ?? false; // a group may be shown thereafter
     if (this.#isClosed) return;
     this.#advance(clip, seconds);
     if (this.#isClosed) return; // by a listener
@@ -259,7 +259,7 @@ export class Session {
       if (this.#shownView !== null) this.#events.viewChanged();
       this.#shownView = view.view;
     }
-    this.#attempt(() => this.#draw(hasTaken));
+    this.#attempt(() => this.#draw(isTaking));
     if (this.#isClosed) return;
     this.#events.frame();
     const isGoing = isMoving || !clock.paused || clock.isSeeking || !this.#isSharp;
@@ -283,7 +283,7 @@ export class Session {
     if (this.isShown && this.fetches) this.sound?.follow(); // a listener may have ended all this
   }
 
-  #draw(hasTaken: boolean): void {
+  #draw(isTaking: boolean): void {
     const { clip, view } = this;
     const [width, height] = this.#size;
     if (clip === null || view === null || this.#picture === null || width === 0 || height === 0) return;
@@ -292,7 +292,7 @@ export class Session {
     // Nothing that is worse than the poster, or than the picture before a jump.
     if (!this.#isInSight || !(clip.canShow(time) || (this.isShown && !isSeeking))) {
       const isPrepared = this.#picture.prepare(clip, camera, this.#shownOptions());
-      this.#isSharp = isPrepared && !hasTaken;
+      this.#isSharp = isPrepared && !isTaking;
       return;
     }
     this.#picture.resize(width, height);

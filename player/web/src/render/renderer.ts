@@ -159,9 +159,15 @@ export class Renderer {
     return scene;
   }
 
-  /** Take rows of a scene that has arrived, as many as a frame has time for; `draw` does so for those that it shows. */
-  upload(scene: DrawnScene): void {
-    if (!this.isLost && !this.#device.isAsked) scene.upload(this.#device);
+  /**
+   * Take rows of a scene that has arrived, as many as a frame has time for; `draw` does so for those that it shows.
+   * @returns false: the card is asked whether it has memory, and gets nothing before it has answered.
+   */
+  upload(scene: DrawnScene): boolean {
+    if (this.isLost) return true; // all is taken again once the card is back
+    if (this.#device.isAsked) return false;
+    scene.upload(this.#device);
+    return true;
   }
 
   removeScene(scene: DrawnScene): void {
