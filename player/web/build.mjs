@@ -8,7 +8,7 @@
  */
 
 import { spawnSync } from 'node:child_process';
-import { readdirSync, rmSync } from 'node:fs';
+import { readdirSync, readFileSync, rmSync } from 'node:fs';
 import { basename, join, resolve } from 'node:path';
 import { parseArgs } from 'node:util';
 import * as esbuild from 'esbuild';
@@ -16,12 +16,25 @@ import * as esbuild from 'esbuild';
 const FOLDER = import.meta.dirname;
 const NOTICE = '/*! kpc-player, Apache-2.0. Contains fzstd, Copyright (c) 2020 Arjun Barrett, MIT License. */';
 
+/** Ends a loop of fzstd 0.1.1 over Huffman weights, of which a tree has at most 255: without it, it may be endless. */
+const boundedWeights = {
+  name: 'bounded Huffman weights',
+  setup(build) {
+    build.onLoad({ filter: /[\\/]fzstd[\\/]esm[\\/]index\.mjs$/ }, ({ path }) => {
+      const parts = readFileSync(path, 'utf-8').split(/for \(;;\) \{(?=\s*fpos -= btr1;)/);
+      if (parts.length !== 2) throw new Error(`${path} has changed: see \`boundedWeights\` in build.mjs`);
+      return { contents: parts.join('while (wc < 256) {'), loader: 'js' };
+    });
+  },
+};
+
 const OPTIONS = {
   absWorkingDir: FOLDER,
   bundle: true,
   charset: 'utf8',
   loader: { '.wasm': 'binary', '.glsl': 'text' },
   logLevel: 'warning',
+  plugins: [boundedWeights],
   target: 'es2022',
 };
 const MINIFIED = { ...OPTIONS, minify: true, legalComments: 'none' };
@@ -61,7 +74,7 @@ async function build(outdir) {
     ...options,
     entryPoints: { 'kpc-player': 'src/index.ts' },
     format: 'esm',
-    plugins: [bundledText],
+    plugins: [...OPTIONS.plugins, bundledText],
   });
   // Beside the player, of which it is a part, and three.js, which the page has.
   await esbuild.build({
@@ -69,7 +82,7 @@ async function build(outdir) {
     entryPoints: { 'kpc-three': 'src/three/index.ts' },
     external: ['three'],
     format: 'esm',
-    plugins: [besidePlayer],
+    plugins: [...OPTIONS.plugins, besidePlayer],
   });
   await esbuild.build({ ...options, entryPoints: { 'kpc-worker': 'src/decoder/worker.ts' }, format: 'iife' });
 }
@@ -86,7 +99,7 @@ async function test(names) {
     outExtension: { '.js': '.mjs' },
     outdir,
     platform: 'node',
-    plugins: [bundledText],
+    plugins: [...OPTIONS.plugins, bundledText],
     sourcemap: 'inline',
   });
   const built = chosen.map((name) => join(outdir, name.replace(/ts$/, 'mjs')));

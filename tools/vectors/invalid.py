@@ -15,7 +15,7 @@ from kpc.encoder.coding.scene_writer import scene_chunks
 from kpc.encoder.coding.transform import HEAD, TransformBlocks, encode_blocks
 from kpc.format.coding.poses import HEAD as POSES_HEAD
 from kpc.format.coding.poses import ROOT
-from kpc.format.container.container import HEADER, Chunk, Codec, Reader
+from kpc.format.container.container import ENTRY, HEADER, Chunk, Codec, Reader
 from kpc.format.container.scene_layout import CAMERA_STRUCT, DECODER_STRUCT, MOTION_STRUCT
 from kpc.format.container.segments import DEPENDENT, SCALAR, TRELLIS, WEIGHT_COUNT
 from kpc.format.scene.scene import ALL_PLANES
@@ -176,6 +176,7 @@ def _container(good: Good) -> dict[str, Refused]:
         "index-huge": (with_index(data, frame=lambda frame: frame + bytes(50 * count)), "bytes of index"),
         "index-crc": (with_entry(data, 2, "group", 1), "index is damaged"),
         "index-garbage": (with_index(data, frame=lambda f: patched(f, 0, "<B", 0)), "index is no valid zstd frame"),
+        "index-weights": (with_index(data, count=8, frame=_endless_weights), "index is no valid zstd frame"),
         "index-long": (with_index(data, frame=lambda frame: frame + b"\0"), "index is no valid zstd frame"),
         "index-fewer": (with_index(data, count=count + 1), "claims another length"),
         "index-kind": (table(3 * count, 0), "four letters"),
@@ -195,6 +196,20 @@ def _container(good: Good) -> dict[str, Refused]:
     ):
         files[name] = good.entry(number, "codec", codec), f"codec {int(codec)}"
     return {name: (content, BROKEN, message) for name, (content, message) in files.items()}
+
+
+def _endless_weights(frame: bytes) -> bytes:
+    """Return a frame that claims an index of 8 chunks, and whose Huffman weights never end for decoders that wait for
+    their bits to run out: one symbol has all 32 states of the FSE table, so that no state takes a bit (RFC 8878,
+    sections 4.1.1 and 4.2.1).
+    """
+    table = struct.pack("<H", 0b111111_0000)  # accuracy 5; value 33, in 6 bits: symbol 0 has probability 32
+    tree = bytes([len(table) + 1]) + table + b"\1"
+    literals = struct.pack("<I", 2 | 6 << 4 | (len(tree) + 1) << 14)[:3] + tree + b"\1"
+    block = literals + b"\0"  # no sequences
+    return (
+        b"\x28\xb5\x2f\xfd\x20" + bytes([8 * ENTRY.size]) + struct.pack("<I", 1 | 2 << 1 | len(block) << 3)[:3] + block
+    )
 
 
 def _segments(good: Good) -> dict[str, Refused]:

@@ -12,7 +12,7 @@ import { layerTexels } from '../src/decoder/texels.js';
 import { Clip, type ClipOptions, type SceneEvent } from '../src/streaming/clip.js';
 import type { SceneStream, TexelRows } from '../src/streaming/scene_stream.js';
 import { read } from './files.js';
-import { spawnNode } from './node_worker.js';
+import { spawnNode, spawnScript } from './node_worker.js';
 import { withServer } from './server.js';
 import { grouped, scene } from './writing.js';
 
@@ -52,6 +52,12 @@ async function withClip(
     clip.close();
   }
 }
+
+test('the index is read in a worker, whose time is limited', async () => {
+  const endless = spawnScript('globalThis.onmessage = ({ data }) => "module" in data && postMessage({ ready: true });');
+  const opening = Clip.open(SAMPLE.slice().buffer, { pool: { spawn: endless, deadlineMs: 500 } });
+  await assert.rejects(opening, hasCode('invalid', 'takes longer than 0.5 s'));
+});
 
 /** Wait until something holds, looking again whenever something has arrived; take all texels meanwhile. */
 async function until(

@@ -29,6 +29,8 @@ export interface ContainerOptions {
   allowPartial?: boolean;
   /** Stored chunks beyond the bytes that are given, by their numbers. */
   bodies?: ReadonlyMap<number, Uint8Array>;
+  /** What `readIndex` made of the bytes elsewhere; without it, the index is read here. */
+  index?: readonly Entry[];
 }
 
 /**
@@ -41,11 +43,11 @@ export class Container {
   readonly bytes: Uint8Array;
   readonly #bodies: ReadonlyMap<number, Uint8Array>;
 
-  constructor(bytes: Uint8Array, { allowPartial = false, bodies = new Map() }: ContainerOptions = {}) {
+  constructor(bytes: Uint8Array, { allowPartial = false, bodies = new Map(), index }: ContainerOptions = {}) {
     this.bytes = bytes;
     this.#bodies = bodies;
     this.header = readHeader(bytes, allowPartial);
-    this.index = readIndex(bytes, this.header);
+    this.index = index ?? readIndex(bytes, this.header);
   }
 
   /** Whether all bytes of a chunk are there. */
@@ -112,8 +114,8 @@ function checkSizes(header: Header, size: number, allowPartial: boolean): void {
   }
 }
 
-/** Read and check the index (section 4.2). */
-function readIndex(bytes: Uint8Array, header: Header): Entry[] {
+/** Read and check the index (section 4.2) of bytes that begin with this header. */
+export function readIndex(bytes: Uint8Array, header: Header): Entry[] {
   const { chunkCount, indexLength, indexCrc, fileLength, largestRaw } = header;
   if (bytes.length < HEADER_LENGTH + indexLength) throw new FormatError('cut off within the chunk index', 'cut-off');
   const index = bytes.subarray(HEADER_LENGTH, HEADER_LENGTH + indexLength);

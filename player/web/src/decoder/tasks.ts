@@ -1,6 +1,7 @@
 /** What a worker does for the page: each task says all that is needed, so that any worker can do any task. */
 
 import { Chunk, type Entry } from '../container/chunk.js';
+import { readHeader, readIndex } from '../container/container.js';
 import { META_LIMIT, type Metadata, parseMetadata } from '../container/metadata.js';
 import { Scene } from '../container/scene.js';
 import type {
@@ -30,6 +31,12 @@ export interface SceneContent {
   cameras: Camera[];
   appearances: Appearance[];
   metadata: Metadata;
+}
+
+/** Read the index of a file from its header and index, `start`. */
+export interface IndexTask {
+  kind: 'index';
+  start: Uint8Array;
 }
 
 /** Read all of a scene but its planes from header and index, `start`, and stored chunks. */
@@ -88,24 +95,25 @@ export interface DriverTask {
   kind: 'driver';
 }
 
-export type Task = SceneTask | MetadataTask | ProjectTask | SegmentTask | SoundTask | DistancesTask | DriverTask;
-export type Result<T extends Task> = T extends SceneTask
-  ? SceneContent
-  : T extends MetadataTask
-    ? Metadata
-    : T extends ProjectTask
-      ? Projection
-      : T extends SoundTask
-        ? SoundSegment
-        : T extends DistancesTask
-          ? Uint8Array<ArrayBuffer>
-          : T extends DriverTask
-            ? undefined
-            : Int8Array<ArrayBuffer> | Uint16Array<ArrayBuffer>;
+/** The tasks by their kinds, and what each results in. */
+interface Tasks {
+  index: [IndexTask, Entry[]];
+  scene: [SceneTask, SceneContent];
+  metadata: [MetadataTask, Metadata];
+  project: [ProjectTask, Projection];
+  segment: [SegmentTask, Int8Array<ArrayBuffer> | Uint16Array<ArrayBuffer>];
+  sound: [SoundTask, SoundSegment];
+  distances: [DistancesTask, Uint8Array<ArrayBuffer>];
+  driver: [DriverTask, undefined];
+}
+export type Task = Tasks[keyof Tasks][0];
+export type Result<T extends Task> = Tasks[T['kind']][1];
 
 /** Do a task; return its result, and the buffers of it that are moved to the page instead of being copied. */
 export function perform(core: Core, task: Task): { result: Result<Task>; moved: ArrayBuffer[] } {
   switch (task.kind) {
+    case 'index':
+      return { result: readIndex(task.start, readHeader(task.start, true)), moved: [] };
     case 'scene':
       return readScene(core, task);
     case 'metadata': {

@@ -146,7 +146,7 @@ export class Clip extends EventTarget {
     memory: number,
     signal?: AbortSignal,
   ): Promise<Clip> {
-    const container = await openContainer(source, signal);
+    const container = await openContainer(source, pool, signal);
     const { index, header } = container;
     const chunks = groupChunks(index);
     const isSingle = chunks.length === 0;

@@ -8,14 +8,15 @@ import type { DecoderPool } from '../decoder/pool.js';
 import type { SceneContent } from '../decoder/tasks.js';
 import type { Source } from './source.js';
 
-/** Read header and index of a file. */
-export async function openContainer(source: Source, signal?: AbortSignal): Promise<Container> {
+/** Read header and index of a file; the index, which is compressed, in a worker, whose time is limited. */
+export async function openContainer(source: Source, pool: DecoderPool, signal?: AbortSignal): Promise<Container> {
   const { indexLength, fileLength } = readHeader(await source.read(0, HEADER_LENGTH, { signal }), true);
   if (source.size !== null && source.size > fileLength) {
     throw new FormatError(`${source.size - fileLength} bytes follow the end of the file`);
   }
   const bytes = await source.read(0, HEADER_LENGTH + indexLength, { signal });
-  return new Container(bytes, { allowPartial: true });
+  const index = await pool.run({ kind: 'index', start: bytes }, { signal });
+  return new Container(bytes, { allowPartial: true, index });
 }
 
 /** Split chunks, in the order given, into runs that lie side by side in the file and take at most so many bytes. */

@@ -155,7 +155,7 @@ export class SceneStream {
     const { signal } = options;
     const begun = new BegunSource(source, FIRST_BYTES);
     try {
-      const container = await openContainer(begun, signal);
+      const container = await openContainer(begun, pool, signal);
       const content = await readContent(begun, container, pool, options.memory, signal);
       options.check?.(content, container);
       return new SceneStream(begun, pool, container, content, options);
