@@ -11,6 +11,8 @@ const MODE = 'immersive-vr';
 const USUAL_FPS = 72;
 /** What a thumbstick does when pushed all the way, radians and metres a second; a small share of it is nothing. */
 const [TURN_SPEED, MOVE_SPEED, REST] = [1.5, 1, 0.15];
+/** Seconds for which a thumbstick moves the scene in one frame at most, so that nothing leaps after a late frame. */
+const LONGEST_STEP = 0.1;
 /** The button of the grip in the standard layout of controllers. */
 const GRIP = 1;
 
@@ -89,7 +91,7 @@ export class Headset {
     const viewer = frame.getViewerPose(this.space);
     if (!viewer) return; // it is not on a head
     const before = this.#placement ?? placedAround(viewer.transform.matrix, host.view, host.metresPerUnit);
-    const placement = this.#moved(before, viewer.transform.matrix, frame, seconds);
+    const placement = this.#moved(before, viewer.transform.matrix, frame, Math.min(seconds, LONGEST_STEP));
     this.#placement = placement;
     const frames = viewer.views.map((view) => this.#eye(placement, view));
     host.draw(frames.filter((eye) => eye !== null));
