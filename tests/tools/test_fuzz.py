@@ -4,6 +4,7 @@ import json
 import os
 import random
 import shutil
+import signal
 import time
 
 import pytest
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from kpc.format.common.errors import FormatError
 from kpc.format.container.scene_io import read
-from kpc.tools.vectors import fuzz, fuzz_bodies
+from kpc.tools.vectors import fuzz, fuzz_bodies, web_reader
 from kpc.tools.vectors.files import encode
 from kpc.tools.vectors.scenes import minimal_scene
 from kpc.tools.vectors.web_reader import WebReader
@@ -80,6 +81,21 @@ def test_the_command_counts_and_keeps_what_it_finds(monkeypatch, tmp_path, capsy
     said = capsys.readouterr()
     assert json.loads(said.out)["count"] == 3 and "1 of 3 files" in said.err
     assert (tmp_path / "found" / "5-2.kpc").read_bytes() == fuzz.file_number(5, 2, fuzz.seeds())
+
+
+def test_a_browser_player_that_does_not_answer_is_ended(minimal, monkeypatch):
+    if shutil.which("node") is None:
+        pytest.skip("needs node")
+    reader = WebReader(fuzz.WEB_BUDGET)
+    try:
+        monkeypatch.setattr(web_reader, "SILENT_S", 0.2)
+        reader._process.send_signal(signal.SIGSTOP)
+        with pytest.raises(AssertionError, match="no answer"):
+            reader.examined(minimal, fuzz.HANG_S)
+        monkeypatch.setattr(web_reader, "SILENT_S", 60.0)
+        assert reader.examined(minimal, fuzz.HANG_S) == "read"
+    finally:
+        reader.close()
 
 
 def test_the_browser_player_reads_or_refuses_what_is_damaged(minimal):

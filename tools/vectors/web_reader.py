@@ -1,6 +1,7 @@
 """The browser player's reader under node, for the fuzzer: it plays each file that it is given."""
 
 import json
+import select
 import shutil
 import struct
 import subprocess
@@ -13,6 +14,8 @@ from kpc.format.common.errors import UsageError
 SCRIPT = Path(kpc.player.__file__).parent / "web" / "tests" / "fuzz_reader.mjs"
 # Megabytes that objects of JavaScript may take; arrays of bytes do not count.
 HEAP_MB = 128
+# Seconds without an answer after which node is ended.
+SILENT_S = 30.0
 # Bytes that node, its threads and earlier files may take beside the budget.
 SLACK = 256 << 20
 
@@ -47,11 +50,12 @@ class WebReader:
         assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.write(struct.pack("<I", len(data)) + data)
         self._process.stdin.flush()
-        line = self._process.stdout.readline()
+        is_there, _, _ = select.select([self._process.stdout], [], [], SILENT_S)
+        line = self._process.stdout.readline() if is_there else b""
         if not line:
             self.close()
             self._process = self._start()
-            raise AssertionError("node has ended")
+            raise AssertionError("node has ended" if is_there else f"no answer after {SILENT_S:.0f} s")
         answer: dict[str, Any] = json.loads(line)
         assert "finding" not in answer, answer["finding"]
         assert answer["rss"] < self._budget + SLACK, f"takes {answer['rss']:,} bytes"
