@@ -775,13 +775,25 @@ scenario('can be used without a mouse', async () => {
 headsetScenarios(scenario, { open, shown, player, button, inside, close, tag: TAG });
 threeScenarios(scenario, browser, address, folder);
 
+/** Milliseconds that a scenario may take. */
+const LIMIT_MS = 90_000;
+
+/** Run a scenario, and wait for it so long. */
+function limited(run) {
+  let timer;
+  const late = new Promise((_, reject) => {
+    timer = setTimeout(() => reject(new Error(`not done after ${LIMIT_MS / 1000} s`)), LIMIT_MS);
+  });
+  return Promise.race([run(), late]).finally(() => clearTimeout(timer));
+}
+
 const results = {};
 try {
   for (const [name, run] of scenarios) {
     if (chosen.length > 0 && !chosen.some((part) => name.includes(part))) continue;
     const started = performance.now();
     try {
-      results[name] = { error: null, value: await run() };
+      results[name] = { error: null, value: await limited(run) };
     } catch (error) {
       results[name] = { error: error.stack, value: null };
       for (const context of browser.contexts()) await context.close();
