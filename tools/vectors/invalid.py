@@ -35,6 +35,7 @@ from kpc.tools.vectors.files import (
     with_index,
 )
 from kpc.tools.vectors.scenes import first_symbol, hybrid_decoder, make_scene, noise, smooth_motion, walked
+from kpc.tools.vectors.zstd_frames import endless_weights, run_of_zeros
 
 BROKEN = "FormatError"
 Refused = tuple[bytes, str, str]  # a file, the name of the error, a part of its message
@@ -176,7 +177,10 @@ def _container(good: Good) -> dict[str, Refused]:
         "index-huge": (with_index(data, frame=lambda frame: frame + bytes(50 * count)), "bytes of index"),
         "index-crc": (with_entry(data, 2, "group", 1), "index is damaged"),
         "index-garbage": (with_index(data, frame=lambda f: patched(f, 0, "<B", 0)), "index is no valid zstd frame"),
-        "index-weights": (with_index(data, count=8, frame=_endless_weights), "index is no valid zstd frame"),
+        "index-weights": (
+            with_index(data, count=8, frame=lambda _: endless_weights(8 * ENTRY.size)),
+            "index is no valid zstd frame",
+        ),
         "index-long": (with_index(data, frame=lambda frame: frame + b"\0"), "index is no valid zstd frame"),
         "index-fewer": (with_index(data, count=count + 1), "claims another length"),
         "index-kind": (table(3 * count, 0), "four letters"),
@@ -198,20 +202,6 @@ def _container(good: Good) -> dict[str, Refused]:
     return {name: (content, BROKEN, message) for name, (content, message) in files.items()}
 
 
-def _endless_weights(frame: bytes) -> bytes:
-    """Return a frame that claims an index of 8 chunks, and whose Huffman weights never end for decoders that wait for
-    their bits to run out: one symbol has all 32 states of the FSE table, so that no state takes a bit (RFC 8878,
-    sections 4.1.1 and 4.2.1).
-    """
-    table = struct.pack("<H", 0b111111_0000)  # accuracy 5; value 33, in 6 bits: symbol 0 has probability 32
-    tree = bytes([len(table) + 1]) + table + b"\1"
-    literals = struct.pack("<I", 2 | 6 << 4 | (len(tree) + 1) << 14)[:3] + tree + b"\1"
-    block = literals + b"\0"  # no sequences
-    return (
-        b"\x28\xb5\x2f\xfd\x20" + bytes([8 * ENTRY.size]) + struct.pack("<I", 1 | 2 << 1 | len(block) << 3)[:3] + block
-    )
-
-
 def _segments(good: Good) -> dict[str, Refused]:
     """Return files that do not list every plane and payload once."""
     files = {
@@ -230,14 +220,8 @@ def _segments(good: Good) -> dict[str, Refused]:
 
 def _raw_planes(good: Good) -> dict[str, Refused]:
     """Return files with damaged plane segments under RAW and ZSTD."""
-    run = 1 << 17  # RFC 8878: a frame that claims 1 MiB, then eight blocks of 128 KiB of zeros each
-    bomb = (
-        b"\x28\xb5\x2f\xfd\xa0"
-        + struct.pack("<I", 8 * run)
-        + b"".join(struct.pack("<I", (block == 7) | 1 << 1 | run << 3)[:3] + b"\0" for block in range(8))
-    )
     stored = [raw(chunk) for chunk in good.chunks]
-    stored[good.xy] = Stored(good.chunks[good.xy], Codec.ZSTD, bomb, 40)
+    stored[good.xy] = Stored(good.chunks[good.xy], Codec.ZSTD, run_of_zeros(), 40)
     files = {
         "zstd-length": (assemble(stored, good.values), "claims another length"),
         "zstd-garbage": (good.entry(good.xy, "codec", Codec.ZSTD), "zstd frame"),
