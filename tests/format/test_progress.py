@@ -11,7 +11,7 @@ import pytest
 from kpc.format.common import compiling
 from kpc.format.common import progress as module
 from kpc.format.common.compiling import CompilationMonitor
-from kpc.format.common.progress import Progress, progress
+from kpc.format.common.progress import Progress, in_parts, part, progress
 
 
 class Clock:
@@ -85,6 +85,26 @@ def test_percent_and_a_total_that_was_a_guess(clock: Clock, capsys: pytest.Captu
         clock.now = 20
         bar.advance(1)
     assert capsys.readouterr().err.splitlines() == ["train: 20 %, 80 s left", "search: 4/6, 20 s left"]
+
+
+def test_parts_of_a_unit_and_parts_of_these(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    reported = []
+    with Progress("render", 2, "pictures") as bar:
+        for _ in in_parts("ab"):
+            for _ in in_parts("cd"):
+                reported.append(bar.done)
+        for _ in progress(range(3), "plate", shown=False):
+            for _ in in_parts("cd"):
+                pass  # parts of the plate's bar
+        bar.advance()
+        reported.append(bar.done)
+        with part(0.25):
+            clock.now = 2.0
+        reported.append(bar.done)
+        bar.advance()
+    assert reported == [0.0, 0.25, 0.5, 0.75, 1.0, 1.25] and bar.done == 2
+    assert capsys.readouterr().err == "render: 1/2 pictures, 62 %, 2 s left\n"
+    assert list(in_parts("without a bar")) == list("without a bar")
 
 
 def test_hidden(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:

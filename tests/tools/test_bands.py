@@ -1,8 +1,8 @@
-"""Large pictures are drawn in bands: the same pixels, and a bar where it takes long."""
+"""Large pictures are drawn in bands: the same pixels, and each band is reported as a part of the picture."""
 
 import numpy as np
-import pytest
 
+from kpc.format.common.progress import Progress
 from kpc.format.scene.cameras import Camera
 from kpc.player.cpu import reference
 from kpc.player.cpu.reference import Rendering
@@ -10,18 +10,20 @@ from kpc.tools.rendering import bands
 from scenes import look_at, tiny_scene
 
 
-def test_bands_give_the_same_picture(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(bands, "BAND_PIXELS", 100)
-    monkeypatch.setattr(bands, "SLOW_S", 0.0)
-    scene, heights = tiny_scene(), []
+def test_bands_give_the_same_picture_and_are_reported() -> None:
+    scene, heights, reported = tiny_scene(), [], []
     camera = look_at((0.5, 0.4, 2.5), (0.0, 0.0, 0.0), 30, 20, 25.0)
 
     def draw(band: Camera) -> Rendering:
         heights.append(band.height)
+        reported.append(pictures.done)
         return reference.render(scene, band, 0.5)
 
-    whole, banded = reference.render(scene, camera, 0.5), bands.in_bands(draw, camera)
+    whole = reference.render(scene, camera, 0.5)
+    with Progress("draw", 1, "pictures", shown=False) as pictures:
+        banded = bands.in_bands(draw, camera, 100)
     assert heights == [3] * 6 + [2]
+    np.testing.assert_allclose(reported, np.arange(7) / 7)
     for field in ("rgb", "depth", "opacity", "samples"):
         np.testing.assert_allclose(getattr(banded, field), getattr(whole, field), atol=1e-5)
     assert whole.opacity.max() > 0.1
@@ -35,5 +37,5 @@ def test_a_small_picture_is_drawn_at_once() -> None:
         return reference.render(tiny_scene(), camera, 0.0)
 
     camera = look_at((0.5, 0.4, 2.5), (0.0, 0.0, 0.0), 8, 6, 7.0)
-    bands.in_bands(draw, camera)
+    bands.in_bands(draw, camera, 48)
     assert cameras == [camera]

@@ -25,18 +25,17 @@ import numpy as np
 import kpc
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
-from kpc.format.common.progress import Progress
+from kpc.format.common.progress import Progress, in_parts
 from kpc.format.common.text import counted, escaped, notice
 from kpc.format.container.groups import GroupedScene, Groups
 from kpc.format.scene.cameras import Camera, View, save_views
 from kpc.format.scene.metadata import Metadata, camera_document
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
-from kpc.player.cpu.reference import Part, Rendering
+from kpc.player.cpu.reference import Part
 from kpc.player.viewpoints import fit_camera
 from kpc.tools.exchange import gltf_cameras
 from kpc.tools.exchange.camera_tracks import Track, load_tracks, placed, views_of
-from kpc.tools.exchange.field import Done
 from kpc.tools.exchange.geometry_files import write_geometry
 from kpc.tools.exchange.mesh import Mesh, surface_mesh
 from kpc.tools.exchange.options import (
@@ -95,16 +94,17 @@ def _export_geometry(task: Task, options: argparse.Namespace) -> None:
         if task.is_folder:
             cli.make_folder(output)
             alone.enter_context(claimed(output, "kpexport", described(options)))
-        bar = alone.enter_context(Progress("export", len(shots), "files"))  # advanced by parts, which may take minutes
+        bar = alone.enter_context(Progress("export", len(shots), "files"))
         for number in shots.numbers:
             time = shots.time(number)
             if render is None:
-                shape: Mesh | Cloud = _mesh(loaded, time, options, bar.advance)
+                shape: Mesh | Cloud = _mesh(loaded, time, options)
             else:
-                shape = _points(loaded, render, time, options, bar.advance)
+                shape = _points(loaded, render, time, options)
             path = output / f"{shots.name(number)}{task.suffix}" if task.is_folder else output
             write_geometry(path, shape, placement)
             count += len(shape.points)
+            bar.advance()
     what = counted(count, "point") if not options.mesh else f"{count:,} {'vertex' if count == 1 else 'vertices'}"
     files = f"{counted(len(shots), 'file')}, " if task.is_folder else ""
     print(escaped(f"{output}: {files}{what}, in {clock.monotonic() - started:.1f} s"))
@@ -134,9 +134,7 @@ def _renderer(loaded: Scene | GroupedScene, options: argparse.Namespace) -> Rend
     return render
 
 
-def _points(
-    loaded: Scene | GroupedScene, render: Render, time: float, options: argparse.Namespace, done: Done
-) -> Cloud:
+def _points(loaded: Scene | GroupedScene, render: Render, time: float, options: argparse.Namespace) -> Cloud:
     scene, local_time = loaded.at(time)
     bounds = scene.bounds
     longest = float((bounds[1] - bounds[0]).max())
@@ -146,22 +144,16 @@ def _points(
     cameras = Rig.of(scene).cameras
     if options.size is not None:
         cameras = tuple(fit_camera(camera, *options.size) for camera in cameras)
-
-    def picture(camera: Camera) -> tuple[Camera, Rendering]:
-        seen = render(camera, time)
-        done(1 / len(cameras))
-        return camera, seen
-
-    cloud = surface_points(map(picture, cameras), bounds, spacing)
+    cloud = surface_points(((camera, render(camera, time)) for camera in in_parts(cameras)), bounds, spacing)
     if not len(cloud.points):
         raise KpcError(f"{options.input}: its cameras see no surface at time {time:g}; choose another --time")
     normals = normals_of(scene, local_time, cloud.points) if options.normals else None
     return Cloud(cloud.points, cloud.colours, normals)
 
 
-def _mesh(loaded: Scene | GroupedScene, time: float, options: argparse.Namespace, done: Done) -> Mesh:
+def _mesh(loaded: Scene | GroupedScene, time: float, options: argparse.Namespace) -> Mesh:
     scene, local_time = loaded.at(time)
-    return surface_mesh(scene, local_time, options.resolution or RESOLUTION, options.density or DENSITY, done)
+    return surface_mesh(scene, local_time, options.resolution or RESOLUTION, options.density or DENSITY)
 
 
 def _export_cameras(task: Task, options: argparse.Namespace) -> None:

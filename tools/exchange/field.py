@@ -1,17 +1,14 @@
 """The density of a scene at points and on grids, in blocks, with empty cells skipped."""
 
-from collections.abc import Callable
-
 import numpy as np
 
+from kpc.format.common.progress import in_parts
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, contract
 from kpc.player.cpu.reference import SceneAtTime, density, features
 
 # Points at which the field is evaluated at once.
 BLOCK = 1 << 16
-# Is called with the share of the work that has been done since the last call.
-Done = Callable[[float], None]
 # Half the distance over which gradients are taken, in edges of the box.
 GRADIENT_REACH = 1.0 / 512
 
@@ -48,25 +45,21 @@ def densities(scene: Scene, moment: SceneAtTime, coordinates: np.ndarray) -> np.
     return found
 
 
-def density_grid(
-    scene: Scene, moment: SceneAtTime, counts: tuple[int, int, int], done: Done = lambda share: None
-) -> np.ndarray:
+def density_grid(scene: Scene, moment: SceneAtTime, counts: tuple[int, int, int]) -> np.ndarray:
     """Return the density on a grid over the box, (Nx, Ny, Nz) float32, whose corners are those of the box.
 
     Args:
         scene: the scene.
         moment: it at a time.
         counts: Nx, Ny, Nz.
-        done: called with the share of the work that has been done since the last call.
     """
     x, y, z = (np.linspace(0, 1, count) for count in counts)
     grid = np.empty(counts, np.float32)
-    for number, share in enumerate(x):
+    for number, share in enumerate(in_parts(x.tolist())):
         plane = np.stack(np.broadcast_arrays(share, *np.meshgrid(y, z, indexing="ij")), axis=-1).reshape(-1, 3)
         # with a contraction the box is the inner half of the planes
         inner = plane / 2 + 0.25 if isinstance(scene.mapping, Contraction) else plane
         grid[number] = densities(scene, moment, inner).reshape(counts[1:])
-        done(1 / len(x))
     return grid
 
 

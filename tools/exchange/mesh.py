@@ -5,15 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpc.format.common.errors import UsageError
+from kpc.format.common.progress import in_parts, part
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, Scene
-from kpc.player.cpu.reference import Rendering, SceneAtTime, render_rays
-from kpc.tools.exchange.field import Done, box_points, density_grid
+from kpc.player.cpu.reference import RAYS_AT_ONCE, Rendering, SceneAtTime, render_rays
+from kpc.tools.exchange.field import box_points, density_grid
 
 # Rays that give a vertex its colour begin this many cells before it.
 AHEAD_CELLS = 2.0
-# Rays that are rendered at once.
-RAYS = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ class Mesh:
     colours: np.ndarray
 
 
-def surface_mesh(scene: Scene, time: float, resolution: int, level: float, done: Done = lambda share: None) -> Mesh:
+def surface_mesh(scene: Scene, time: float, resolution: int, level: float) -> Mesh:
     """Return the isosurface of the density in the box of a scene at a time in [0, 1].
 
     A vertex is coloured as the one of the scene's cameras sees it that faces it most, by a ray that begins just before
@@ -44,7 +43,6 @@ def surface_mesh(scene: Scene, time: float, resolution: int, level: float, done:
         time: in [0, 1] over it.
         resolution: points of the grid along the longest edge of the box.
         level: density of the surface, per longest edge of the box.
-        done: as for `density_grid`.
 
     Raises:
         UsageError: the density does not cross the level.
@@ -54,7 +52,8 @@ def surface_mesh(scene: Scene, time: float, resolution: int, level: float, done:
     edges = (scene.aabb[1] - scene.aabb[0]).astype(np.float64)
     counts = np.maximum(np.round(edges / edges.max() * (resolution - 1)).astype(int) + 1, 2)
     nx, ny, nz = counts.tolist()
-    grid = density_grid(scene, SceneAtTime.of(scene, time), (nx, ny, nz), lambda share: done(share / 2))
+    with part(1 / 2):
+        grid = density_grid(scene, SceneAtTime.of(scene, time), (nx, ny, nz))
     if not level < grid.max():
         raise UsageError(
             f"--density {level:g}: no surface; the density goes up to {grid.max():.3g} per longest edge of the box"
@@ -67,7 +66,8 @@ def surface_mesh(scene: Scene, time: float, resolution: int, level: float, done:
     triangles = _outward(points, triangles.astype(np.int64))
     normals = _vertex_normals(points, triangles)
     spacing = float((scene.bounds[1] - scene.bounds[0]).max()) / (resolution - 1)
-    colours = _colours(scene, time, points, normals, AHEAD_CELLS * spacing, lambda share: done(share / 2))
+    with part(1 / 2):
+        colours = _colours(scene, time, points, normals, AHEAD_CELLS * spacing)
     return Mesh(points, triangles, normals, colours)
 
 
@@ -91,9 +91,7 @@ def _vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1), [0.0, 1.0, 0.0])
 
 
-def _colours(
-    scene: Scene, time: float, points: np.ndarray, normals: np.ndarray, ahead: float, done: Done
-) -> np.ndarray:
+def _colours(scene: Scene, time: float, points: np.ndarray, normals: np.ndarray, ahead: float) -> np.ndarray:
     eyes = np.stack([camera.camera_to_world[:3, 3] for camera in Rig.of(scene).cameras])
     directions, facing = -normals, np.full(len(points), -2.0)
     for eye in eyes:
@@ -104,10 +102,9 @@ def _colours(
         facing = np.maximum(facing, cosine)
     origins = (points - ahead * directions).astype(np.float32)
     colours = []
-    for start in range(0, len(points), RAYS):
-        some = slice(start, start + RAYS)
+    for start in in_parts(range(0, len(points), RAYS_AT_ONCE)):
+        some = slice(start, start + RAYS_AT_ONCE)
         colours.append(_straight(scene, render_rays(scene, origins[some], directions[some].astype(np.float32), time)))
-        done(len(colours[-1]) / len(points))
     return np.concatenate(colours)
 
 

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kpc.format.common.progress import progress
+from kpc.format.common.progress import in_parts, progress
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Rendering
@@ -54,15 +54,26 @@ class CleanPlates:
 
     def of(self, scene: Scene, camera: Camera) -> Rendering:
         """Return the plate of a camera."""
-        for known_scene, known, plate in self._plates:
-            if known_scene is scene and _are_equal(known, camera):
-                return plate
-        times = INSTANTS if scene.is_dynamic else INSTANTS[:1]
-        # A camera that moves needs a plate for each frame; the bar of the frames shows how much time those take.
-        shown = progress(times.tolist(), "clean plate", unit="pictures", shown=not self._plates)
-        plate = clean_plate([self._draw(scene, camera, time) for time in shown])
+        if (known := self._known(scene, camera)) is not None:
+            return known
+        times = _times(scene)
+        # A camera that moves needs a plate for each frame, which then is part of the frame.
+        reported = in_parts(times) if self._plates else progress(times, "clean plate", unit="pictures")
+        plate = clean_plate([self._draw(scene, camera, time) for time in reported])
         self._plates = [*self._plates[-1:], (scene, camera, plate)]
         return plate
+
+    def pictures_of(self, scene: Scene, camera: Camera) -> int:
+        """Return how many pictures the plate of a camera takes that no bar of its own reports; 0 if it is there."""
+        return len(_times(scene)) if self._plates and self._known(scene, camera) is None else 0
+
+    def _known(self, scene: Scene, camera: Camera) -> Rendering | None:
+        return next((plate for of, by, plate in self._plates if of is scene and _are_equal(by, camera)), None)
+
+
+def _times(scene: Scene) -> list[float]:
+    times: list[float] = (INSTANTS if scene.is_dynamic else INSTANTS[:1]).tolist()
+    return times
 
 
 def clean_plate(pictures: list[Rendering]) -> Rendering:

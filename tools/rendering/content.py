@@ -9,6 +9,7 @@ import numpy as np
 
 from kpc.format.common.errors import UsageError
 from kpc.format.common.images import linear_from_srgb, srgb_from_linear
+from kpc.format.common.progress import in_parts, part
 from kpc.format.container.groups import GroupedScene
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
@@ -20,6 +21,8 @@ from kpc.tools.rendering.clean_plate import CleanPlates, matte, motion_colours
 
 # Renders a camera's picture at a time in [0, 1] over the clip.
 Render = Callable[[Camera, float], Rendering]
+# Pixels that are drawn at once by OpenGL in software, within a second; smaller bands would take more time in all.
+SOFTWARE_PIXELS = 1 << 15
 # Contents that are drawn over black, not over the scene's background.
 BLACK_BEHIND = ("moving", "matte")
 # Draws a scene, one of those needed at a time of the clip, at a time of its own.
@@ -41,13 +44,18 @@ def renderer_of(loaded: Scene | GroupedScene, options: argparse.Namespace) -> tu
     def render(camera: Camera, time: float) -> Rendering:
         parts, pictures = loaded.blend_at(time), []
         needed[:] = [scene for scene, *_ in parts]
-        for scene, local_time, share in parts:
+        for scene, local_time, share in in_parts(parts):
             if options.content == "plate":
                 picture = plates.of(scene, camera)
-            else:
+            elif options.content is None:
                 picture = draw(scene, camera, local_time, needed)
-                if options.content is not None:
-                    picture = _what_moves(scene, picture, matte(picture, plates.of(scene, camera)), options.content)
+            else:
+                count = plates.pictures_of(scene, camera)
+                with part(count / (count + 1)):
+                    plate = plates.of(scene, camera)
+                with part(1 / (count + 1)):
+                    picture = draw(scene, camera, local_time, needed)
+                picture = _what_moves(scene, picture, matte(picture, plate), options.content)
             if options.background is not None:
                 uncovered = (1 - picture.opacity)[..., None]
                 behind = np.zeros(3, np.float32) if options.content in BLACK_BEHIND else scene.background
@@ -89,7 +97,7 @@ def _gl_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
         def drawn(camera: Camera) -> Rendering:
             return renderer.render(camera, time, part=options.part, appearance=appearance)
 
-        return in_bands(drawn, camera) if is_slow else drawn(camera)
+        return in_bands(drawn, camera, SOFTWARE_PIXELS) if is_slow else drawn(camera)
 
     return draw, offscreen.describe(ctx)
 
@@ -97,9 +105,11 @@ def _gl_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
 def _reference_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
     def draw(scene: Scene, camera: Camera, time: float, needed: Sequence[Scene]) -> Rendering:
         appearance = appearance_of(scene, options.appearance)
-        return in_bands(
-            lambda band: reference.render(scene, band, time, part=options.part, appearance=appearance), camera
-        )
+
+        def drawn(camera: Camera) -> Rendering:
+            return reference.render(scene, camera, time, part=options.part, appearance=appearance)
+
+        return in_bands(drawn, camera, reference.RAYS_AT_ONCE)
 
     return draw, "reference renderer (numpy)"
 
@@ -123,7 +133,7 @@ def mean_picture(
     light: list[np.ndarray] = []
     opacity: list[np.ndarray] = []
     middle, total = None, 0
-    for number, (camera, time) in enumerate(instants):
+    for number, (camera, time) in enumerate(in_parts(instants)):
         width, height = camera.width * samples, camera.height * samples
         fine = render(camera.resized(width, height) if samples > 1 else camera, time)
         cells = camera.height, samples, camera.width, samples
