@@ -40,6 +40,7 @@ from kpc.format.common import interrupts
 from kpc.format.common.compiling import working_s
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.common.progress import Progress
+from kpc.format.common.text import counted
 from kpc.format.container import scene_io
 from kpc.format.container.rewriting import with_metadata
 from kpc.format.scene.scene import Scene
@@ -184,7 +185,7 @@ def _code(trainer: Trainer, scene: Scene, options: Options) -> CodedModel:
         tune_steps = steps_per_group(trainer.step, scene, trainer.config.tune_steps)
     log(describe_occupancy(scene))
     if tune_steps:
-        log(f"fine-tuning: {tune_steps} steps after each group of planes that is coded")
+        log(f"fine-tuning: {counted(tune_steps, 'step')} after each group of planes that is coded")
     effort = trainer.config.coding_effort(trainer.step)
     if effort < 1:
         log(f"coding: at {effort:.0%} of the usual effort, after {trainer.step:,} steps of {options.preset}")

@@ -15,7 +15,7 @@ from kpc.encoder.cli.options import Options
 from kpc.encoder.field.field import Field
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.common.errors import UsageError
-from kpc.format.common.text import counted
+from kpc.format.common.text import agreeing, counted
 from kpc.format.container.container import ENTRY, HEADER
 from kpc.format.container.groups import Span
 from kpc.format.scene.scene import TIME_PLANES, Clip, Scene
@@ -37,8 +37,8 @@ def split_into_spans(clip: Clip, group_s: float) -> tuple[Span, ...]:
     frames = int(group_s * clip.fps + 1e-6)
     if frames < MIN_FRAMES:
         raise UsageError(
-            f"--group {group_s:g}s: {frames} frames at {clip.fps:g} fps are too few for a group; give at least "
-            f"{MIN_FRAMES / clip.fps:.2g}s"
+            f"--group {group_s:g}s: {counted(frames, 'frame')} at {clip.fps:g} fps {agreeing(frames, 'is', 'are')} too "
+            f"few for a group; give at least {MIN_FRAMES / clip.fps:.2g}s"
         )
     count = -(-clip.frame_count // frames)
     ends = [number * clip.frame_count // count for number in range(count + 1)]

@@ -18,7 +18,7 @@ from kpc.encoder.training.temporal_resolution import TimeResolution
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.cli import print_json
 from kpc.format.common.progress import Progress
-from kpc.format.common.text import escaped, notice
+from kpc.format.common.text import counted, escaped, notice
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import FAR, Contraction, DeviceCoordinates
 
@@ -150,7 +150,7 @@ def _print_encode(result: dict[str, Any], options: Options) -> None:
     if tested:
         quality = (
             f"held-out PSNR {result['test_psnr']:.2f} dB{_describe_parts(result)}, SSIM {result['test_ssim']:.4f} over "
-            f"{result['test_pictures']} of {result['held_out_pictures']} pictures"
+            f"{result['test_pictures']} of {counted(result['held_out_pictures'], 'picture')}"
         )
         if result["appearances"]:
             quality += ", right halves, each in an appearance fitted to its left half"
@@ -166,8 +166,9 @@ def _print_encode(result: dict[str, Any], options: Options) -> None:
         print(f"time-plane texels exactly at identity: {result['identity_share']:.1%}")
     if len(result.get("groups", [])) > 1:
         print(f"{len(result['groups'])} groups: " + ", ".join(_describe_group(group) for group in result["groups"]))
+    steps = counted(result["steps"], "step")
     print(
-        f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps) "
+        f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({steps}) "
         f"and coding {result['coding_s']:.0f} s; the rest is reading, testing and, the first time, compiling"
     )
     if result["coding_s"] > result["train_s"]:

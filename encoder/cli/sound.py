@@ -12,6 +12,7 @@ from kpc.encoder.datasets import Dataset
 from kpc.encoder.datasets.capture import printable
 from kpc.encoder.datasets.sound_tracks import MEASURED_S, Clarity, clarity, clearest, has_sound, read_samples
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import agreeing
 from kpc.format.container.clip_sound import sample_at
 from kpc.format.container.groups import Span
 from kpc.format.scene.sound import Sound
@@ -105,7 +106,8 @@ def _clearest(dataset: Dataset, files: dict[str, Path]) -> tuple[Path | None, st
             found[name] = clarity(samples)
     best = clearest(found)
     if best is None:
-        return None, f"the tracks of all {len(found)} videos are silent" if found else "no video has a sound track"
+        silent = agreeing(len(found), "the only track is silent", f"the tracks of all {len(found)} videos are silent")
+        return None, silent if found else "no video has a sound track"
     one = found[best]
     level = f"{one.range_db:.0f} dB above its noise floor{', clipped' if one.is_clipped else ''}"
     among = f"the clearest of {len(found)} tracks, " if len(found) > 1 else "the only track, " if len(files) > 1 else ""

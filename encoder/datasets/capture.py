@@ -15,7 +15,7 @@ from kpc.encoder.datasets.video import VideoInfo, video_info
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
 from kpc.format.common.media_files import IMAGE_SUFFIXES, is_video
-from kpc.format.common.text import notice
+from kpc.format.common.text import agreeing, counted, notice
 from kpc.format.scene.camera_checks import NO_DISTORTION, Distortion, check_depths, check_lens, check_pose
 
 # Where neither the dataset nor the user names test images, every eighth is one, as in LLFF (arXiv:1905.00889).
@@ -367,11 +367,13 @@ def report_missing(file: Path, folder: Path, missing: list[str], total: int) -> 
         DatasetError: none of the images exists.
     """
     if len(missing) == total:
-        raise DatasetError(
-            f"{file}: none of its {total} images exists ({printable(missing[0])} ...); copy them to {folder}"
-        )
+        which = f"{printable(missing[0])} ..." if total > 1 else printable(missing[0])
+        them = agreeing(total, "it", "them")
+        raise DatasetError(f"{file}: none of its {counted(total, 'image')} exists ({which}); copy {them} to {folder}")
     if missing:
-        notice(f"{file}: {len(missing)} of {total} frames have no image and are skipped: {first_names(missing)}")
+        words = agreeing(len(missing), "has no image and is", "have no image and are")
+        share = f"{len(missing)} of {counted(total, 'frame')}"
+        notice(f"{file}: {share} {words} skipped: {first_names(missing)}")
 
 
 def report_orientations(root: Path, views: Iterable[CapturedView]) -> None:
@@ -380,13 +382,15 @@ def report_orientations(root: Path, views: Iterable[CapturedView]) -> None:
     stored = [view.file.name for view in views if view.orientation != 1 and not view.upright]
     if turned:
         notice(
-            f"{root}: {len(turned)} images are turned by their EXIF orientation, since the calibration is for that "
-            f"size: {first_names(turned)}"
+            f"{root}: {counted(len(turned), 'image')} "
+            f"{agreeing(len(turned), 'is turned by its', 'are turned by their')} EXIF orientation, since the "
+            f"calibration is for that size: {first_names(turned)}"
         )
     if stored:
+        words = agreeing(len(stored), "has an EXIF orientation, but is", "have an EXIF orientation, but are")
         notice(
-            f"{root}: {len(stored)} images have an EXIF orientation, but are used as stored, since the calibration "
-            f"does not ask for another size; if it is for turned images, turn the files: {first_names(stored)}"
+            f"{root}: {counted(len(stored), 'image')} {words} used as stored, since the calibration does not ask for "
+            f"another size; if it is for turned images, turn the files: {first_names(stored)}"
         )
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from kpc.encoder.datasets.capture import Capture, first_names
 from kpc.format.common.media_files import is_hidden, is_image, is_video
-from kpc.format.common.text import notice
+from kpc.format.common.text import agreeing, counted, notice
 
 
 def media_in(folder: Path, *, recursive: bool = False) -> list[Path]:
@@ -33,7 +33,8 @@ def count_left_out(root: Path, capture: Capture, masks: Iterable[Path]) -> int:
     unnamed = sorted(file.relative_to(root).as_posix() for file in left_out - set(capture.left_out))
     if unnamed:
         notice(
-            f"{root}: {len(unnamed)} of {len(used | left_out)} files found belong to no camera and are left out: "
+            f"{root}: {len(unnamed)} of {counted(len(used | left_out), 'file')} found "
+            f"{agreeing(len(unnamed), 'belongs to no camera and is', 'belong to no camera and are')} left out: "
             f"{first_names(unnamed)}"
         )
     return len(left_out)

@@ -15,7 +15,7 @@ from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprin
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info, read_mask
 from kpc.format.common.progress import Progress
-from kpc.format.common.text import notice
+from kpc.format.common.text import agreeing, counted, notice
 
 # The folder of masks within a dataset.
 FOLDER = "masks"
@@ -113,8 +113,9 @@ def find_masks(root: Path, views: Sequence[CapturedView]) -> list[MaskFile | Non
     if unmasked and (any(masks) or folder.is_dir()):
         total = sum(not view.video for view in views)
         notice(
-            f"{folder if folder.is_dir() else root}: {len(unmasked)} of {total} images have no mask and are used "
-            f"entirely: {first_names(unmasked)}"
+            f"{folder if folder.is_dir() else root}: {len(unmasked)} of {counted(total, 'image')} "
+            f"{agreeing(len(unmasked), 'has no mask and is', 'have no mask and are')} used entirely: "
+            f"{first_names(unmasked)}"
         )
     return masks
 

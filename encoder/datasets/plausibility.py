@@ -9,7 +9,7 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.datasets.dataset import Dataset
-from kpc.format.common.text import counted
+from kpc.format.common.text import agreeing, counted
 
 # Pictures that are looked at, evenly spread over all of them, and rows of each.
 PICTURES, ROWS = 256, 8
@@ -50,10 +50,13 @@ def _flat_pictures(dataset: Dataset) -> Iterator[str]:
     if not flat or not all(_is_flat(dataset, n) for n in flat[:VERIFIED]):
         return
     is_empty = dataset.has_alpha and dataset.pixels.picture(flat[0])[..., 3].max() <= FLAT
-    meaning = "show nothing (they are transparent)" if is_empty else "are of one colour"
+    of_one = "shows nothing (it is transparent)" if is_empty else "is of one colour"
+    of_more = "show nothing (they are transparent)" if is_empty else "are of one colour"
     names = first_names(list(dict.fromkeys(dataset.pictures.file[n] for n in flat)))
-    share = "all" if len(flat) == len(looked_at) else f"{len(flat)} of {len(looked_at)}"
-    yield f"{share} pictures looked at {meaning}: {names}; check these files"
+    of_all = agreeing(len(flat), "the only picture", "all pictures")
+    share = of_all if len(flat) == len(looked_at) else f"{len(flat)} of {counted(len(looked_at), 'picture')}"
+    meaning = agreeing(len(flat), of_one, of_more)
+    yield f"{share} looked at {meaning}: {names}; check these files"
 
 
 def _is_flat(dataset: Dataset, number: int, rows: int | None = None) -> bool:
@@ -107,7 +110,8 @@ def _equal_pictures(dataset: Dataset) -> Iterator[str]:
     if trained:
         names = first_names(list(dict.fromkeys(pictures.file[n] for n in trained)))
         yield (
-            f"{len(trained)} of {int(pictures.is_test.sum())} test pictures are also trained on: {names}; what is "
+            f"{len(trained)} of {counted(int(pictures.is_test.sum()), 'test picture')} "
+            f"{agreeing(len(trained), 'is', 'are')} also trained on: {names}; what is "
             "measured on them means nothing"
         )
     train = [[n for n in numbers if not pictures.is_test[n]] for numbers in equal]

@@ -13,7 +13,7 @@ from av.video.stream import VideoStream
 
 from kpc.encoder.datasets.containers import open_container
 from kpc.format.common.errors import MediaError
-from kpc.format.common.text import counted
+from kpc.format.common.text import agreeing, counted
 
 # Containers whose time line begins at 0, by libav's names. The clocks of others start anywhere.
 MP4, MATROSKA, AVI, MPEG_TS = "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts"
@@ -101,9 +101,12 @@ def read_time_stamps(
         unseen = counted(int(lead.sum()), "frame")
         notes.append(f"the first {unseen} cannot be decoded without what came before; left out")
     if packets.before_start:
-        notes.append(f"{packets.before_start} frames before its time line starts are not shown; left out")
+        early = f"{counted(packets.before_start, 'frame')} before its time line starts"
+        notes.append(f"{early} {agreeing(packets.before_start, 'is', 'are')} not shown; left out")
     if len(shown) < len(pts) and stream.codec_context.name not in HIDES_FRAMES:
-        notes.append(f"{len(pts) - len(shown)} frames have the time stamp of the next and are never shown; left out")
+        count = len(pts) - len(shown)
+        words = agreeing(count, "has the time stamp of the next and is", "have the time stamp of the next and are")
+        notes.append(f"{counted(count, 'frame')} {words} never shown; left out")
     times = shown[~lead] * tick.numerator / tick.denominator
     times = times + _origin_s(path, container, stream, packets)
     return TimeStamps(times, fps, True, packets.missing, tuple(notes))

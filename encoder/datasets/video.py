@@ -31,6 +31,7 @@ from kpc.encoder.datasets.time_stamps import read_time_stamps
 from kpc.format.common.errors import MediaError
 from kpc.format.common.films import SCALE_FLAGS
 from kpc.format.common.media_files import require_file
+from kpc.format.common.text import agreeing, counted
 
 # The colour matrices that ffmpeg's scale filter converts, by their numbers in ITU-T H.273, and those of H.273 that it
 # does not. 2 and 3 mean that the matrix is unknown.
@@ -287,7 +288,8 @@ def _is_at(info: VideoInfo, number: int, frame: VideoFrame, origin: int) -> bool
 
 
 def _damaged(path: str | os.PathLike[str], whole: int, count: int) -> MediaError:
-    return MediaError(f"{path}: {whole} of its {count} frames decode, so it is damaged or cut off; copy it anew")
+    share = f"{whole} of its {counted(count, 'frame')} {agreeing(whole, 'decodes', 'decode')}"
+    return MediaError(f"{path}: {share}, so it is damaged or cut off; copy it anew")
 
 
 def _converted(

@@ -19,6 +19,7 @@ from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import march_scene
 from kpc.encoder.field.render import Rays, shade
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import agreeing, counted
 from kpc.format.container.scene_layout import APPEARANCE_LIMIT, is_valid_name
 from kpc.format.scene.scene import Scene
 
@@ -47,9 +48,11 @@ def choose_appearance(dataset: Dataset) -> tuple[str, str]:
     )
     _, counts = np.unique(lenses, axis=0, return_counts=True)
     alone, total = int((counts == 1).sum()), len(lenses)
+    share = f"{alone} of {counted(total, 'picture')}"
+    why = f"{share} {agreeing(alone, 'has a lens or size of its', 'have a lens or size of their')} own"
     if 2 * alone <= total or total > APPEARANCE_LIMIT:
-        return "none", f"{alone} of {total} pictures have a lens or size of their own"
-    return "image", f"photographs: {alone} of {total} pictures have a lens or size of their own"
+        return "none", why
+    return "image", f"photographs: {why}"
 
 
 def assign_appearances(dataset: Dataset, kind: str) -> tuple[np.ndarray, tuple[str, ...]]:

@@ -21,7 +21,7 @@ from kpc.encoder.poses.wishes import Wishes
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info, read_image
 from kpc.format.common.progress import progress
-from kpc.format.common.text import notice
+from kpc.format.common.text import agreeing, counted, notice
 
 # Attempts at a still rig: features in each picture, and instants at which what moves is matched.
 ATTEMPTS = ((4096, 4), (8192, 10))
@@ -76,7 +76,7 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
         )
     elif all(frame_count(one) == 1 for one in footage):
         frames = "; --rig moving for the frames of a clip" if _is_numbered(footage) else ""
-        notice(f"{root}: taken for photographs of one scene ({len(footage)} images{frames})")
+        notice(f"{root}: taken for photographs of one scene ({counted(len(footage), 'image')}{frames})")
         found = _find_photographs(root, footage)
     else:
         surveys = [survey(one) for one in progress(footage, "looking at what moves", unit="camera")]
@@ -108,15 +108,16 @@ def _what(footage: Sequence[Footage], surveys: Sequence[Survey], is_still: bool,
     shares = [f"{seen.still_share:.0%}" for seen in surveys if np.isfinite(seen.still_share)]
     why = "as --rig says" if rig != "auto" else f"{min(shares, default='?')} of a picture's texture stays, or more"
     if is_still:
-        return f"taken for a rig of {len(footage)} cameras that stand still ({why})"
+        stand = agreeing(len(footage), "stands", "stand")
+        return f"taken for a rig of {counted(len(footage), 'camera')} that {stand} still ({why})"
     return f"taken for {'a camera that moves' if len(footage) == 1 else 'cameras that move'} ({why})"
 
 
 def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Survey], wishes: Wishes) -> Found:
     if len(footage) < LEAST_CAMERAS:
         raise DatasetError(
-            f"{root}: {len(footage)} camera{'s' * (len(footage) > 1)} that stand still: depth needs {LEAST_CAMERAS} or "
-            "more; film with more cameras, or walk around with one"
+            f"{root}: {counted(len(footage), 'camera')} that {agreeing(len(footage), 'stands', 'stand')} still: depth "
+            f"needs {LEAST_CAMERAS} or more; film with more cameras, or walk around with one"
         )
     names = [one.name for one in footage]
     lenses = _lenses([seen.median.shape for seen in surveys])

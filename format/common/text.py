@@ -62,6 +62,11 @@ def counted(count: int, noun: str) -> str:
     return f"{count:,} {noun}" + "s" * (count != 1)
 
 
+def agreeing(count: int, one: str, more: str) -> str:
+    """Return the words that agree with a number: `one` if it is one, else `more`."""
+    return one if count == 1 else more
+
+
 def byte_text(count: int) -> str:
     """Return a number of bytes for a message, in the largest unit of which it is one: "20 KB", "1.5 GB"."""
     power = max((p for p in (9, 6, 3) if count >= 10**p), default=0)

@@ -318,8 +318,8 @@ NAMES = [f"images/{k:04d}.png" for k in range(10)]
         (None, NAMES[:2], NAMES[2:4], [2, 3], [0, 1], "2 pictures are in val_filenames beside test_filenames and left"),
         (NAMES[3:8], NAMES[:2], NAMES[2:3], [2], [0, 1, 8, 9], "4 pictures are not in train_filenames nor test_file"),
         (NAMES[3:8], NAMES[:2], None, [0, 1], [2, 8, 9], "3 pictures are not in train_filenames nor val_filenames"),
-        (NAMES, None, NAMES[:1], [0], [], "1 pictures are in two of its lists and held out"),
-        (None, None, ["images/0004.png", "gone.png"], [4], [], "1 names in test_filenames have no frame: gone.png"),
+        (NAMES, None, NAMES[:1], [0], [], "1 picture is in two of its lists and held out"),
+        (None, None, ["images/0004.png", "gone.png"], [4], [], "1 name in test_filenames has no frame: gone.png"),
     ],
 )
 def test_lists_of_pictures(

@@ -95,7 +95,7 @@ def test_masks_of_easymocap_are_alpha(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "masks of the foreground" in capsys.readouterr().err
     (tmp_path / "set/masks/01/000001.png").unlink()
     assert load(tmp_path / "set").pixels.picture(3)[..., 3].min() == 255
-    assert "1 of 6 pictures have none: 000001.png" in capsys.readouterr().err
+    assert "1 of 6 pictures has none: 000001.png" in capsys.readouterr().err
     write_mask(tmp_path / "set/masks/01/000001.png", shown[:-1])
     fails(tmp_path / "set", "is 40x29, but its picture is 40x30")
 
@@ -114,7 +114,7 @@ def test_what_is_there_twice_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
         (tmp_path / f"set/images/{('00', '01', '010')[k]}").rename(tmp_path / f"old{k}")
     dataset = load(tmp_path / "set", holdout="none")
     printed = capsys.readouterr().err
-    assert "1 of 3 cameras have no video or images and are left out: 010" in printed
+    assert "1 of 3 cameras has no video or images and is left out: 010" in printed
     assert "2 of 4 files found belong to no camera" in printed and "videos/11.mp4, videos/making of.mp4" in printed
     assert dataset.camera_names == ("00", "01")
 

@@ -90,7 +90,7 @@ def test_a_time_stamp_twice(tmp_path: Path) -> None:
     """The second of two frames with one time stamp is seen."""
     film(tmp_path / "x.mkv", "-c:v", "ffv1", "-vf", "settb=1/1000,setpts='if(eq(N,5),400,N*100)'", *PASS)
     shown = [n for n in range(12) if n != 4]
-    check(tmp_path / "x.mkv", shown, [0.4 if n == 5 else n / 10 for n in shown], "1 frames")
+    check(tmp_path / "x.mkv", shown, [0.4 if n == 5 else n / 10 for n in shown], "1 frame has")
 
 
 def test_a_recording_that_starts_between_key_frames(tmp_path: Path) -> None:

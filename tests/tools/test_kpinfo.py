@@ -252,7 +252,7 @@ def test_several_files_with_totals(scene_file, tmp_path, capsys):
     )
     assert errors.splitlines() == [
         f"kpinfo: {files[2]}: No such file or directory",
-        "kpinfo: 1 of 3 files are damaged or cannot be read",
+        "kpinfo: 1 of 3 files is damaged or cannot be read",
     ]
     assert kpinfo.main([*files, "--verify", "--json"]) == 1
     printed = json_of(capsys)

@@ -18,6 +18,7 @@ import sys
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
 from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.common.text import agreeing
 from kpc.tools.cli.kpinfo_facts import SCHEMA, examine, totals
 from kpc.tools.cli.kpinfo_page import page, table
 
@@ -52,7 +53,8 @@ def _command(argv: list[str]) -> None:
     elif not sums["failed"]:
         print(page(files[0]))
     if sums["failed"]:
-        summary = f"{sums['failed']} of {len(files)} files are damaged or cannot be read"
+        are = agreeing(sums["failed"], "is", "are")
+        summary = f"{sums['failed']} of {len(files)} files {are} damaged or cannot be read"
         raise KpcError(files[0]["error"] if is_one else summary)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
-from kpc.format.common.text import escaped, notice
+from kpc.format.common.text import counted, escaped, notice
 from kpc.format.container import groups
 from kpc.format.scene.metadata import camera_document, differences
 from kpc.tools.editing.clips import Edits, edit
@@ -57,7 +57,7 @@ def _command(argv: list[str]) -> None:
             parts = groups.group_inputs(_at_rate(options.scenes, options.fps, Path(folder)))
         size = groups.write(parts, options.output)
     clip = groups.Timeline(tuple(part.span for part in parts), parts[0].fps).clip
-    duration = f"{clip.frame_count:,} frames at {clip.fps:g} fps, {clip.total_s:.2f} s"
+    duration = f"{counted(clip.frame_count, 'frame')} at {clip.fps:g} fps, {clip.total_s:.2f} s"
     if differing := differences([part.metadata for part in parts]):
         notice(f"kpjoin: the files differ, so the clip has no {', '.join(differing)}")
     if _cameras_differ(options.scenes):

@@ -16,7 +16,7 @@ from kpc.encoder.datasets.layouts.transforms import (
     report_contradictions,
 )
 from kpc.encoder.datasets.left_out import media_in
-from kpc.format.common.text import notice
+from kpc.format.common.text import agreeing, counted, notice
 
 # The layout's name in messages.
 NAME = "Blender"
@@ -42,7 +42,8 @@ def read(path: Path, holdout: str | None) -> Capture:
         document = load_transforms(file)
         if split == "val" and "test" in splits and holdout is None:
             left_out = _existing(path, file, document)
-            notice(f"{file}: {len(left_out)} pictures are left out, since the test split is held out")
+            left = f"{counted(len(left_out), 'picture')} {agreeing(len(left_out), 'is', 'are')} left out"
+            notice(f"{file}: {left}, since the test split is held out")
             continue
         images = find_images(path, file, document)
         report_contradictions(file, document, next(iter(images.values())))

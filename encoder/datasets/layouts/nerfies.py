@@ -35,7 +35,7 @@ from kpc.encoder.datasets.layouts.documents import MAX_BYTES, read_json
 from kpc.encoder.datasets.layouts.transforms import frame_rate
 from kpc.encoder.datasets.left_out import media_in
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.text import notice
+from kpc.format.common.text import agreeing, counted, notice
 from kpc.format.scene.camera_checks import number_of
 
 # The layout's name in messages.
@@ -111,7 +111,8 @@ def _ids(file: Path) -> tuple[set[str], set[str]]:
     if not train | val:
         raise DatasetError(f"{file}: train_ids and val_ids list nothing; copy it anew")
     if left := sorted(every - train - val, key=natural_key):
-        notice(f"{file}: {len(left)} ids are in neither train_ids nor val_ids: {first_names(left)}")
+        ids = f"{counted(len(left), 'id')} {agreeing(len(left), 'is', 'are')}"
+        notice(f"{file}: {ids} in neither train_ids nor val_ids: {first_names(left)}")
     return train, val
 
 

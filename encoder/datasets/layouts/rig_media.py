@@ -32,7 +32,7 @@ from kpc.encoder.datasets.layouts.calibration import RigCamera
 from kpc.encoder.datasets.left_out import media_in
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media_files import is_hidden, is_video
-from kpc.format.common.text import notice
+from kpc.format.common.text import agreeing, counted, notice
 
 # What precedes the number of a camera in names of files.
 _PREFIX = re.compile(r"(camera|cam|port|view|hd|vga|kinect|video)[-_ ]*", re.IGNORECASE)
@@ -89,7 +89,8 @@ def read_rig(
     missing = [camera.name for camera in cameras if camera.name not in media]
     if missing:
         notice(
-            f"{file}: {len(missing)} of {len(cameras)} cameras have no video or images and are left out: "
+            f"{file}: {len(missing)} of {counted(len(cameras), 'camera')} "
+            f"{agreeing(len(missing), 'has no video or images and is', 'have no video or images and are')} left out: "
             f"{first_names(missing)}"
         )
     paths = [media[camera.name].path for camera in used]
@@ -106,7 +107,8 @@ def read_rig(
     _report_centres(file, views)
     if masks is not None:
         without = [view.file.name for view in views if view.foreground is None]
-        lack = f"; {len(without)} of {len(views)} pictures have none: {first_names(without)}" if without else ""
+        share = f"{len(without)} of {counted(len(views), 'picture')} {agreeing(len(without), 'has', 'have')}"
+        lack = f"; {share} none: {first_names(without)}" if without else ""
         notice(f"{masks}: masks of the foreground; what they leave out is transparent{lack}")
     return Capture(layout, tuple(views), None, tuple(found))
 
@@ -139,8 +141,8 @@ def _media(
     if not found:
         searched = " or ".join("the folder itself" if folder == "." else f"{folder}/" for folder in folders)
         raise problem or DatasetError(
-            f"{file}: none of its {len(names)} cameras ({first_names(names)}) has a video or images in {searched}; "
-            "name videos, or folders of images, after the cameras"
+            f"{file}: none of its {counted(len(names), 'camera')} ({first_names(names)}) has a video or images in "
+            f"{searched}; name videos, or folders of images, after the cameras"
         )
     found.sort(key=lambda kind: (-len(kind[2]), kind[1] == prefers_images))  # stable: of equals the first
     folder, is_film, chosen, entries = found[0]
@@ -237,8 +239,8 @@ def _times(root: Path, media: Sequence[Media]) -> list[list[float | None]]:
         if len(set(counts)) > 1:
             fewest, most = (media[counts.index(n)].path.name for n in (min(counts), max(counts)))
             raise DatasetError(
-                f"{root}: {printable(fewest)} has {min(counts)} images, {printable(most)} {max(counts)}, and their "
-                "names do not number the instants; name the images by their instants, such as 000000.jpg"
+                f"{root}: {printable(fewest)} has {counted(min(counts), 'image')}, {printable(most)} {max(counts)}, "
+                "and their names do not number the instants; name the images by their instants, such as 000000.jpg"
             )
         notice(
             f"{root}: the names of images do not number the instants, so that their order does: the first of each "

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from kpc.encoder.datasets.capture import HOLD_OUT_EVERY, find_image, first_names
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.text import notice
+from kpc.format.common.text import agreeing, counted, notice
 
 # What becomes of a picture; None if it is left out.
 Part = Literal["train", "test"] | None
@@ -62,7 +62,8 @@ def _listed(root: Path, file: Path, document: dict[str, Any], key: str, known: s
     if names and len(unmatched) == len(listed):
         raise DatasetError(f"{file}: {key} names no frame ({first_names(unmatched)}); correct it or remove it")
     if unmatched:
-        notice(f"{file}: {len(unmatched)} names in {key} have no frame: {first_names(unmatched)}")
+        have = agreeing(len(unmatched), "has", "have")
+        notice(f"{file}: {counted(len(unmatched), 'name')} in {key} {have} no frame: {first_names(unmatched)}")
     return set(listed.values())
 
 
@@ -73,4 +74,4 @@ def _resolved(root: Path, file: Path, name: str) -> Path:
 
 def _report(file: Path, root: Path, images: Sequence[Path], what: str) -> None:
     names = first_names([image.relative_to(root).as_posix() for image in images])
-    notice(f"{file}: {len(images)} pictures are {what}: {names}")
+    notice(f"{file}: {counted(len(images), 'picture')} {agreeing(len(images), 'is', 'are')} {what}: {names}")
