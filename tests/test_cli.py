@@ -27,7 +27,7 @@ def raising(error: BaseException, cause: BaseException | None = None) -> Callabl
 @pytest.mark.parametrize(
     "error, cause, code, line",
     [
-        (FormatError("a.kpc: cut\noff"), None, 1, "a.kpc: cut off"),
+        (FormatError("a\n  b.kpc: cut off"), None, 1, "a\\n  b.kpc: cut off"),
         (UsageError("no such option"), None, 2, "no such option"),
         (OSError(errno.ENOENT, "nothing there", "b.kpc"), None, 1, "b.kpc: nothing there"),
         (OSError(errno.ENOSPC, "full"), None, 1, "full"),
@@ -144,6 +144,13 @@ def test_commands_that_read_files_alone_refuse_addresses(module: str, capsys: py
         importlib.import_module(f"kpc.{module}").main(["https://user:secret@host/a.kpc", "-o", "b.kpc"])
     err = capsys.readouterr().err
     assert ended.value.code == 2 and err.endswith("download the file and give its path\n") and "secret" not in err
+
+
+@pytest.mark.parametrize("module", ["encoder.cli.kpenc", "tools.cli.kpedit", "tools.cli.kpjoin"])
+def test_errors_of_options_are_one_line(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        importlib.import_module(f"kpc.{module}").main(["none.kpc", "-o", "b.kpc", "--c\nd"])
+    assert capsys.readouterr().err.endswith("error: unrecognized arguments: --c\\nd\n")
 
 
 @pytest.mark.parametrize(

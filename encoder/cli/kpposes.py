@@ -45,7 +45,7 @@ def _command(argv: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = cli.Parser(
         prog="kpposes", description="Find the cameras of a folder of videos, and bring the videos in step."
     )
     cli.add_version_option(parser)

@@ -158,7 +158,7 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     Returns:
         The options, whether only to plan (--dry-run), and whether to print JSON.
     """
-    parser = argparse.ArgumentParser(
+    parser = cli.Parser(
         "kpenc",
         description="Encode a folder of posed videos or images as a .kpc file. Given a finished checkpoint or a .kpc "
         "file instead, code it anew, without pictures and without training.",

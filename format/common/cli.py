@@ -13,7 +13,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from kpc.format.common import interrupts
 from kpc.format.common.errors import KpcError, UsageError
@@ -83,6 +83,14 @@ def message_of(error: KpcError | OSError) -> str | None:
     return f"{where}{error.strerror or error}"
 
 
+class Parser(argparse.ArgumentParser):
+    """A parser of a command's options whose errors are one line; names in them may hold line breaks."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and the error, and exit with 2."""
+        super().error(escaped(message))
+
+
 def add_version_option(parser: argparse.ArgumentParser) -> None:
     """Give a command's parser `--version`, which prints the version of KPC and exits."""
     parser.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
@@ -102,8 +110,8 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def print_error(name: str, message: str) -> None:
-    """Print an error of a command as one line on stderr; control codes, which a terminal would obey, as escapes."""
-    notice(f"{name}: {' '.join(message.split())}")
+    """Print an error of a command as one line on stderr; line breaks, and what a terminal would obey, as escapes."""
+    notice(f"{name}: {message}")
 
 
 def _fail(name: str, message: str, code: int) -> int:

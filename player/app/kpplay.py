@@ -92,9 +92,7 @@ def _play_in_browser(options: argparse.Namespace) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="kpplay", description="Play a .kpc scene in a window. Press H there for the list of keys."
-    )
+    parser = cli.Parser(prog="kpplay", description="Play a .kpc scene in a window. Press H there for the list of keys.")
     cli.add_version_option(parser)
     parser.add_argument(
         "scenes",

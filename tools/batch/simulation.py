@@ -9,7 +9,6 @@ fail at random moments; a scene goes on from its last checkpoint on the next wor
 little time for each message, one at a time. The plot needs matplotlib.
 """
 
-import argparse
 import heapq
 import sys
 from collections.abc import Sequence
@@ -152,7 +151,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="simulation", description="Simulate kpbatch on many workers that fail.")
+    parser = cli.Parser(prog="simulation", description="Simulate kpbatch on many workers that fail.")
     parser.add_argument("--scenes", type=int, default=Model.scenes, help="default: %(default)s")
     parser.add_argument("--workers", type=int, default=Model.workers, help="default: %(default)s")
     parser.add_argument("--scene-s", type=float, default=Model.scene_s, help="mean time of a scene (%(default)s)")

@@ -6,7 +6,6 @@ Records of one kind, name and settings are compared. A figure has changed if the
 times of a single run count as noisy by `--noise`.
 """
 
-import argparse
 import json
 import statistics
 from collections.abc import Sequence
@@ -73,7 +72,7 @@ def main(argv: Sequence[str]) -> None:
         FormatError: a file holds no records.
         WorseError: something is worse.
     """
-    parser = argparse.ArgumentParser(
+    parser = cli.Parser(
         "kpbench compare", description="Print what is better and worse in new records; exit with 1 if anything is."
     )
     for name in ("before", "after"):

@@ -81,7 +81,7 @@ def _command(argv: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = cli.Parser(
         "kpbench", description="Measure encoding or playing; write JSON to stdout or --out, and a table to stderr."
     )
     cli.add_version_option(parser)

@@ -13,7 +13,6 @@ each frame, those of `stability` errors against what is swept. The suffix of the
 PNG or PDF. Needs the extra `bench`: `pip install ".[bench]"` in a checkout.
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -275,9 +274,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(
-        "plot", description="Draw records of kpbench curve, codec, groups, player or quality."
-    )
+    parser = cli.Parser("plot", description="Draw records of kpbench curve, codec, groups, player or quality.")
     cli.add_version_option(parser)
     parser.add_argument("records", type=cli.named_path, nargs="+", help="files that kpbench --out wrote")
     parser.add_argument(

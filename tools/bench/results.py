@@ -7,7 +7,6 @@ The first prints the tables as Markdown, the second rewrites those between the m
 `<!-- encode: begin -->` and `<!-- encode: end -->`. Tables in documents always come from here.
 """
 
-import argparse
 import re
 import sys
 from collections.abc import Iterable, Sequence
@@ -79,7 +78,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser("results", description="Write benchmark records as Markdown tables.")
+    parser = cli.Parser("results", description="Write benchmark records as Markdown tables.")
     cli.add_version_option(parser)
     parser.add_argument("records", type=cli.named_path, nargs="+", help="files that kpbench --out wrote")
     parser.add_argument(

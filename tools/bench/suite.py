@@ -67,7 +67,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = cli.Parser(
         "kpbench suite", description="Measure all that kpbench can, from one commit; run again to go on."
     )
     parser.add_argument(

@@ -4,7 +4,6 @@ kprender scene.kpc --cameras gt/cameras.json --depth -o rendered
 python -m kpc.tools.cli.contactsheet gt rendered -o sheet.png
 """
 
-import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -145,7 +144,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser("contactsheet", description="Put rendered pictures beside the true ones.")
+    parser = cli.Parser("contactsheet", description="Put rendered pictures beside the true ones.")
     cli.add_version_option(parser)
     parser.add_argument("truth", type=cli.named_path, help="folder of true pictures")
     parser.add_argument(

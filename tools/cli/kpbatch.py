@@ -133,7 +133,7 @@ def _batch(options: argparse.Namespace, words: Sequence[str]) -> Batch:
 
 def _parse(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
     """Return the options, and those of kpenc behind --."""
-    parser = argparse.ArgumentParser(
+    parser = cli.Parser(
         prog="kpbatch",
         description="Encode many scenes, and code many files, on this machine or on a Dask cluster. What is done is "
         "not done again.",

@@ -72,7 +72,7 @@ def _command(argv: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="kpedit", description="Change a .kpc file without training again.")
+    parser = cli.Parser(prog="kpedit", description="Change a .kpc file without training again.")
     cli.add_version_option(parser)
     parser.add_argument("scene", type=cli.input_path, help="a .kpc file")
     parser.add_argument(

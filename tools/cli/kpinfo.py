@@ -59,7 +59,7 @@ def _command(argv: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="kpinfo", description="Show what is inside .kpc files.")
+    parser = cli.Parser(prog="kpinfo", description="Show what is inside .kpc files.")
     cli.add_version_option(parser)
     parser.add_argument("files", nargs="+", type=cli.file_name, metavar="file", help="a .kpc file, or its http address")
     parser.add_argument("--json", action="store_true", help="print a JSON object (docs/kpinfo.schema.json)")

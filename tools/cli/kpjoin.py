@@ -7,7 +7,6 @@
 Nothing is encoded again: each file becomes a group of the clip, and one group is in memory at a time.
 """
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -28,7 +27,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(
+    parser = cli.Parser(
         prog="kpjoin",
         description="Join .kpc files into one clip. Parts of one clip are put in the order of their frames; other "
         "files follow one another in the given order.",

@@ -80,9 +80,7 @@ def _command(argv: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="kpshare", description="Make a folder for any web host, with pages that play scenes."
-    )
+    parser = cli.Parser(prog="kpshare", description="Make a folder for any web host, with pages that play scenes.")
     cli.add_version_option(parser)
     parser.add_argument(
         "scenes", nargs="*", type=cli.input_path, metavar="scene", help=".kpc files, or folders of them"

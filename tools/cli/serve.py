@@ -24,7 +24,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser("serve", description="Serve a folder to this machine by HTTP, with byte ranges.")
+    parser = cli.Parser("serve", description="Serve a folder to this machine by HTTP, with byte ranges.")
     cli.add_version_option(parser)
     parser.add_argument("folder", type=cli.named_path, help="the folder to serve")
     parser.add_argument("--port", type=int, default=8000, help="TCP port (default: %(default)s)")

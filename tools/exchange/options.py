@@ -48,7 +48,7 @@ class Task:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of kpexport's command line."""
-    made = argparse.ArgumentParser(
+    made = cli.Parser(
         prog="kpexport",
         description="Exchange points, meshes and cameras with Blender, Houdini, Unreal, Nuke and other programs: a "
         ".kpc scene becomes coloured points or a mesh (.ply, .glb); its cameras, a camera file or a path of the "

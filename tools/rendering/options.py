@@ -22,9 +22,7 @@ MAX_SAMPLES = 16
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of kprender's command line."""
-    made = argparse.ArgumentParser(
-        prog="kprender", description="Render a .kpc scene to pictures or a film, without a window."
-    )
+    made = cli.Parser(prog="kprender", description="Render a .kpc scene to pictures or a film, without a window.")
     cli.add_version_option(made)
     made.add_argument("scene", type=cli.file_name, help="a .kpc file, or its http address")
     _add_cameras(made.add_argument_group("cameras"))

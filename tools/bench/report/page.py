@@ -5,7 +5,6 @@
 What is absent, the page says, with the command that makes it; a record that it cannot show, it names.
 """
 
-import argparse
 import base64
 import binascii
 import json
@@ -54,9 +53,7 @@ def main(argv: Sequence[str]) -> None:
         FormatError: a file holds no list of records.
         KpcError: the page would be too large.
     """
-    parser = argparse.ArgumentParser(
-        "kpbench report", description="Draw benchmark records on one page that needs no network."
-    )
+    parser = cli.Parser("kpbench report", description="Draw benchmark records on one page that needs no network.")
     parser.add_argument(
         "records", type=cli.input_path, nargs="+", metavar="JSON", help="files that kpbench --out wrote"
     )
