@@ -68,9 +68,8 @@ class Address:
             parts, shown, port, name = _split(text)
             host = shown if ":" in shown else _ascii_host(shown)
         except ValueError:  # its text may quote a password, as may the exceptions that it stands for
-            raise NetworkError(
-                "not a valid address; check its host and port, and write / ? # @ in a password as %2F %3F %23 %40"
-            ) from None
+            encode = ", and write / ? # @ in a password as %2F %3F %23 %40" if "@" in text else ""
+            raise NetworkError(f"not a valid address; check its host and port{encode}") from None
         if parts.scheme not in SCHEMES:
             raise NetworkError(
                 f"{name}: no http or https address; other schemes cannot be read, so download it or give its path"
@@ -140,7 +139,8 @@ def _ascii_host(host: str) -> str:
         if any(letter in host for letter in AMBIGUOUS_LETTERS):
             raise ValueError("ambiguous")
         host = host.encode("idna").decode("ascii").lower()
-    if not re.fullmatch(r"[\w.~-]{0,253}", host, re.ASCII):
+    labels = host.removesuffix(".").split(".") if host else []
+    if len(host) > 253 or not all(re.fullmatch(r"[\w~-]{1,63}", label, re.ASCII) for label in labels):
         raise ValueError("not a host name")
     return host
 

@@ -137,6 +137,11 @@ def test_the_page_of_someone_else_stays(tmp_path: Path, capsys: pytest.CaptureFi
         (["--gallery", "missing"], "no such folder"),
         ([str(SAMPLE), "--title", "A"], "kpedit --title"),
         ([str(SAMPLE), "--url", "host/a"], "no address"),
+        ([str(SAMPLE), "--url", "https://my host/a"], "'https://my host/a' is no address"),
+        ([str(SAMPLE), "--url", "https://host:99999/"], "no address"),
+        ([str(SAMPLE), "--url", "https://host..example/"], "no address"),
+        ([str(SAMPLE), "--url", "https://user:secret@host/a"], "would be published"),
+        ([str(SAMPLE), "--url", "https://host/a?b"], "followed by ? or #"),
         (["https://host/a.kpc"], "download"),
     ],
 )

@@ -13,14 +13,15 @@ import argparse
 import sys
 import tempfile
 from pathlib import Path
-from urllib.parse import urljoin, urlsplit
+from urllib.parse import urljoin
 
 import kpc
 from kpc.format.common import cli
-from kpc.format.common.errors import UsageError
+from kpc.format.common.errors import NetworkError, UsageError
 from kpc.format.common.images import write_image
 from kpc.format.common.progress import progress
 from kpc.format.common.text import counted, escaped
+from kpc.format.container.http_address import Address, public_name
 from kpc.player.app.playlist import Playlist
 from kpc.player.sharing import site
 from kpc.player.sharing.site import SharedScene
@@ -118,10 +119,19 @@ def _read(file: Path, name: str, poster: Path) -> SharedScene:
 
 
 def _url(text: str) -> str:
-    parts = urlsplit(text)
-    if parts.scheme not in ("http", "https") or not parts.netloc:
-        raise argparse.ArgumentTypeError(f"{text!r} is no address of a web page, such as https://example.org/scene/")
-    return text if text.endswith("/") else text + "/"
+    """Parse the address of a folder of a web host; return it as browsers request it, with a slash at its end."""
+    try:
+        address = Address.parse(text)
+    except NetworkError:
+        shown = public_name(text)
+        raise argparse.ArgumentTypeError(
+            f"{shown!r} is no address of a web page, such as https://example.org/scene/"
+        ) from None
+    if address.authorization is not None:
+        raise argparse.ArgumentTypeError("user and password would be published; leave them out")
+    if "?" in text or "#" in text:
+        raise argparse.ArgumentTypeError(f"{address.name!r} is followed by ? or #, which no folder has; leave them out")
+    return address.url if address.url.endswith("/") else address.url + "/"
 
 
 if __name__ == "__main__":
