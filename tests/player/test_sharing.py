@@ -19,6 +19,7 @@ from kpc.player.sharing import site
 from kpc.player.sharing.site import SharedScene
 from kpc.player.sharing.web_view import serving_pages
 from kpc.tools.cli import kpshare
+from kpc.tools.rendering.claims import claimed
 
 SAMPLE = Path(__file__).parent.parent.parent / "samples" / "default.kpc"
 HOSTILE = '"><script>alert(1)</script>&'
@@ -200,6 +201,18 @@ def test_a_scene_that_lay_in_the_folder_is_never_replaced(
     for source in sources[1:]:
         assert kpshare.main([str(source), "-o", str(tmp_path / "site")]) == 0, "its own copies are replaced"
     assert sources[0].read_bytes() == edited
+
+
+def test_a_folder_that_another_run_writes_stays_as_it_is(
+    tmp_path: Path, quick_posters: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with claimed(tmp_path, "kpshare", {"sources": "others"}):
+        held = sorted(tmp_path.iterdir())
+        assert kpshare.main([str(SAMPLE), "-o", str(tmp_path)]) == 2
+        assert "another kpshare with other options is at work there" in capsys.readouterr().err
+        assert sorted(tmp_path.iterdir()) == held
+    assert kpshare.main([str(SAMPLE), "-o", str(tmp_path)]) == 0
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_what_is_no_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,9 @@ browser on this machine.
 import argparse
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 from urllib.parse import urljoin
 
 import kpc
@@ -25,6 +27,7 @@ from kpc.format.container.http_address import Address, public_name
 from kpc.player.app.playlist import Playlist
 from kpc.player.sharing import site
 from kpc.player.sharing.site import SharedScene
+from kpc.tools.rendering.claims import claimed
 from kpc.tools.rendering.poster import render_poster
 
 # The quality of posters as JPEG: they are seen for a second, and are to be no larger than scenes.
@@ -46,21 +49,26 @@ def _command(argv: list[str]) -> None:
     folders = [folder / name if is_gallery else folder for name in names]
     player = site.player_files()
     at_page = {} if is_gallery else player  # those of a gallery lie above its pages
-    if is_gallery:
-        site.check_folder(folder, player)
     beside: list[dict[str, Path | bytes]] = [{f"{name}.kpc": file} for file, name in zip(files, names, strict=True)]
-    for place, wanted in zip(folders, beside, strict=True):
-        site.check_folder(place, {**at_page, **wanted})
+
+    def check() -> None:
+        if is_gallery:
+            site.check_folder(folder, player)
+        for place, wanted in zip(folders, beside, strict=True):
+            site.check_folder(place, {**at_page, **wanted})
+
+    check()
     root = "../" if is_gallery else ""
     with tempfile.TemporaryDirectory() as aside:
         # Nothing is written into the folder if one of the scenes cannot be read, or a poster would replace another.
         posters = [Path(aside) / f"{name}.jpg" for name in names]
         inputs = progress(list(zip(files, names, posters, strict=True)), "kpshare", unit="scenes")
         scenes = {name: _read(file, name, poster) for file, name, poster in inputs}
-        for place, wanted, poster in zip(folders, beside, posters, strict=True):
+        for wanted, poster in zip(beside, posters, strict=True):
             wanted[site.POSTER] = poster.read_bytes()
-            site.check_folder(place, {**at_page, **wanted})
-        folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    with claimed(folder, "kpshare", _described(files, options)):
+        check()  # again, with the posters, and in case another run has ended meanwhile
         site.copy_player(folder)
         for (name, scene), place, wanted in zip(scenes.items(), folders, beside, strict=True):
             place.mkdir(exist_ok=True)
@@ -70,14 +78,21 @@ def _command(argv: list[str]) -> None:
             url = None if options.url is None else urljoin(options.url, f"{name}/" if is_gallery else "")
             page = site.scene_page(scene, root=root, url=url)
             site.write_file(place / site.PAGE, site.with_record(page, own))
-    if is_gallery:
-        title = options.title or (options.gallery or folder).absolute().name
-        site.write_file(folder / site.PAGE, site.with_record(site.gallery_page(scenes, title, options.url), player))
+        if is_gallery:
+            title = options.title or (options.gallery or folder).absolute().name
+            page = site.gallery_page(scenes, title, options.url)
+            site.write_file(folder / site.PAGE, site.with_record(page, player))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     what = f"{counted(len(files), 'scene')}, {size:,} bytes"
     print(escaped(f"{folder / site.PAGE}: {what}; put {folder} on a web host"))
     if not is_gallery:
         print("\nTo show it within another page:\n" + site.embed_snippet(scenes[names[0]], url=options.url))
+
+
+def _described(files: Sequence[Path], options: argparse.Namespace) -> dict[str, Any]:
+    """Return what the files in the folder depend on."""
+    sources = [[str(file.absolute()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+    return {"sources": sources, "title": options.title, "url": options.url}
 
 
 def _parser() -> argparse.ArgumentParser:
