@@ -1,10 +1,17 @@
 """The entry points of the commands. Each loads its module, which takes seconds, while Ctrl-C already ends it."""
 
-import signal
-from functools import partial
-from importlib import import_module
+import os
+import sys
 
-from kpc.format.common import interrupts
+try:
+    import signal
+    from functools import partial
+    from importlib import import_module
+
+    from kpc.format.common import interrupts
+except KeyboardInterrupt:  # before there is anything that `interrupts` could end
+    print(f"{os.path.basename(sys.argv[0])}: interrupted", file=sys.stderr)
+    sys.exit(130)
 
 
 def _run(name: str, module: str, argv: list[str] | None = None) -> int:

@@ -22,6 +22,22 @@ def interrupted(folder: Path, command: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", program, str(folder)], capture_output=True, text=True, timeout=120)
 
 
+def test_the_first_import_ends_quietly() -> None:
+    """Ctrl-C raises KeyboardInterrupt there, since nothing handles it yet."""
+    program = """
+        import sys
+        class Keyboard:
+            def find_spec(self, name, *_):
+                if name == "kpc.format.common.interrupts":
+                    raise KeyboardInterrupt
+        sys.meta_path.insert(0, Keyboard())
+        sys.argv = ["/usr/bin/kpx"]
+        import kpc.commands
+    """
+    ended = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "kpx: interrupted\n")
+
+
 @pytest.mark.parametrize(
     "command",
     [
