@@ -10,7 +10,7 @@ try:
 
     from kpc.format.common import interrupts
 except KeyboardInterrupt:  # before there is anything that `interrupts` could end
-    print(f"{os.path.basename(sys.argv[0])}: interrupted", file=sys.stderr)
+    os.write(2, os.fsencode(f"{os.path.basename(sys.argv[0])}: interrupted\n"))
     sys.exit(130)
 
 
