@@ -98,6 +98,9 @@ def _transcode_groups(options: Options, source: groups.Groups) -> dict[str, Any]
     spans, parts, found, is_copy = source.timeline.spans, [], [], True
     clip = _with_history(source.metadata(), options)
     trades = [options_of_group(options, number, spans).trade for number in range(len(spans))]
+    copied = with_metadata(options.source, _with_members(source.metadata(), options))
+    if options.trade.target_bytes is not None and len(copied) <= options.trade.target_bytes:
+        trades = [options.trade] * len(spans)  # all groups fit, however their sizes differ
     if options.trade.target_bytes is not None:  # a size that is too small for a late group is refused at once, too
         for number, trade in enumerate(trades):
             codec_model.check_size(scene_io.read(source.open(number)), trade, is_coded=True)
@@ -112,8 +115,7 @@ def _transcode_groups(options: Options, source: groups.Groups) -> dict[str, Any]
         parts.append(groups.GroupInput.of(coded.data, span.start))
         found.append(coding_figures(coded, coded.size_bytes, trade, EVALUATED_ON[1]))
     if is_copy:
-        data = with_metadata(options.source, _with_members(source.metadata(), options))
-        size = rewriting.save(data, options.output)
+        size = rewriting.save(copied, options.output)
     else:
         size = groups.write(parts, options.output, clip)
     return {

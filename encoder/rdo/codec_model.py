@@ -293,6 +293,12 @@ class _Coder:
         )
         return controller.meet(self.trade, tolerance)
 
+    def coded(self, found: Attempt, pruned: Pruned | None = None, spare_db: float = 0.0) -> CodedModel:
+        """Return the coded model that an attempt made; the other arguments as in `CodedModel`."""
+        measured: Fidelity = found.measured
+        loss_db = self.uncoded_psnr - measured.psnr
+        return CodedModel(found.quantised, found.data, measured.psnr, loss_db, measured.agreement_db, pruned, spare_db)
+
 
 def code(
     model: Model,
@@ -318,6 +324,9 @@ def code(
     """
     check_size(model.scene, trade, is_coded=model.coded is not None)
     coder = _Coder(model, trade, prune_share, tune_steps, quantise, grids)
+    unchanged = None if model.coded is None else Attempt(model.coded, coder.measure, 0.0)
+    if unchanged is not None and trade.target_bytes is not None and unchanged.size_bytes <= trade.target_bytes:
+        return coder.coded(unchanged)  # no other is better
     chosen = coder.select()
     tolerance = TOLERANCE if model.effort == 1 else QUICK_TOLERANCE
     found, pruned = coder.meet(chosen, tune_steps, tolerance), chosen.pruned
@@ -326,8 +335,7 @@ def code(
             f"{found.size_bytes:,} bytes is the smallest size of this model, and --target-size leaves "
             f"{trade.target_bytes:,} for it; give a larger one, or train anew with a smaller --preset"
         )
-    if model.coded is not None:
-        unchanged = Attempt(model.coded, coder.measure, 0.0)
+    if unchanged is not None:
 
         def spent(one: Attempt) -> float:
             if trade.lam is None:
@@ -336,11 +344,7 @@ def code(
 
         if spent(unchanged) <= spent(found):
             found, pruned = unchanged, None
-    measured: Fidelity = found.measured
-    loss_db = coder.uncoded_psnr - measured.psnr
-    return CodedModel(
-        found.quantised, found.data, measured.psnr, loss_db, measured.agreement_db, pruned, chosen.spare_db
-    )
+    return coder.coded(found, pruned, chosen.spare_db)
 
 
 def check_size(scene: Scene | QuantisedScene, trade: Trade, *, is_coded: bool) -> None:

@@ -327,10 +327,6 @@ class RateController:
             if self.source_file is not None and least >= self._attempt(0.0).cost(bound):
                 return self._attempt(0.0)  # without minutes of fine-tuning
             return min(found, self._tuned(found.exponent), key=lambda one: one.cost(bound))
-        if name == "target_bytes" and self.source_file is not None:
-            whole = self._attempt(0.0)
-            if whole.size_bytes <= bound:
-                return whole
         goal = self._goal(trade, finest, coarsest)
         if self.tune is None:
             return self._search(goal, guess, tolerance)

@@ -237,12 +237,16 @@ def test_a_file_is_copied_where_nothing_is_better(
     assert capsys.readouterr().out == f"{copy}: {size:,} bytes, a copy of the source, since {why}\n"
 
 
+@pytest.mark.parametrize("target", ["1MB", "as large"])
 def test_a_clip_in_groups_is_copied_with_the_metadata_that_is_given(
-    scene_file: Path, tmp_path: Path, kpenc_says: Kpenc
+    scene_file: Path, tmp_path: Path, kpenc_says: Kpenc, monkeypatch: pytest.MonkeyPatch, target: str
 ) -> None:
     clip, copy = tmp_path / "clip.kpc", tmp_path / "same.kpc"
     groups.write(groups.group_inputs([scene_file, scene_file]), clip)
-    result = kpenc_says(clip, copy, "--target-size", "1MB", "--title", "A dancer")
+    monkeypatch.setattr(codec_model, "estimate_curvature", lambda *_, **__: pytest.fail("searches"))
+    size = len(rewriting.with_metadata(clip, Metadata({"title": "A dancer"})))
+    wanted = str(size) if target == "as large" else target
+    result = kpenc_says(clip, copy, "--target-size", wanted, "--title", "A dancer")
     assert result["is_copy"] and copy.read_bytes() == rewriting.with_metadata(clip, Metadata({"title": "A dancer"}))
 
 
