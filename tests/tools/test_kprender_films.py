@@ -113,7 +113,8 @@ def test_a_clip_that_hardly_moves_has_too_many_pictures() -> None:
         (["--from", 2], "the last frame is at 1.00 s"),
         (["--to", "2s"], "the last frame ends at 1.10 s"),
         (["--from", 0.5, "--to", 0.4], "no frame lies"),
-        (["--frames", "5-11"], "the last frame is 10"),
+        (["--frames", "5-11"], "--frames 5-11: the last frame is 10"),
+        (["--frames", "11"], "--frames 11: the last frame is 10"),
         (["--frames", "4-2"], "range of frames"),
         (["--frames", "4-6", "--from", 0.1], "--frames chooses frames"),
         (["--frames", "4-6", "--to", "0s"], "--frames chooses frames"),
@@ -240,7 +241,7 @@ def test_resuming_skips_whole_pictures(run: Run, scene_file: Path, tmp_path: Pat
         (["--static-only"], "what is shown"),
         (["--samples", "2"], "--samples"),
         (["--camera", "0"], "--camera"),
-        (["--size", "12x9"], "--size"),  # whole pictures of a long run are not replaced
+        (["--size", "12x9"], "--size (16x12, now 12x9)"),  # whole pictures of a long run are not replaced
     ],
 )
 def test_resuming_with_other_options_is_refused(

@@ -10,11 +10,11 @@ browser on this machine.
 """
 
 import argparse
+import contextlib
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 from urllib.parse import urljoin
 
 import kpc
@@ -59,16 +59,14 @@ def _command(argv: list[str]) -> None:
 
     check()
     root = "../" if is_gallery else ""
-    with tempfile.TemporaryDirectory() as aside:
+    with _held(folder, files, options), tempfile.TemporaryDirectory() as aside:
         # Nothing is written into the folder if one of the scenes cannot be read, or a poster would replace another.
         posters = [Path(aside) / f"{name}.jpg" for name in names]
         inputs = progress(list(zip(files, names, posters, strict=True)), "kpshare", unit="scenes")
         scenes = {name: _read(file, name, poster) for file, name, poster in inputs}
         for wanted, poster in zip(beside, posters, strict=True):
             wanted[site.POSTER] = poster.read_bytes()
-    folder.mkdir(parents=True, exist_ok=True)
-    with claimed(folder, "kpshare", _described(files, options)):
-        check()  # again, with the posters, and in case another run has ended meanwhile
+        check()  # again, with the posters
         site.copy_player(folder)
         for (name, scene), place, wanted in zip(scenes.items(), folders, beside, strict=True):
             place.mkdir(exist_ok=True)
@@ -89,10 +87,19 @@ def _command(argv: list[str]) -> None:
         print("\nTo show it within another page:\n" + site.embed_snippet(scenes[names[0]], url=options.url))
 
 
-def _described(files: Sequence[Path], options: argparse.Namespace) -> dict[str, Any]:
-    """Return what the files in the folder depend on."""
+@contextlib.contextmanager
+def _held(folder: Path, files: Sequence[Path], options: argparse.Namespace) -> Iterator[None]:
+    """Make a folder and keep runs with other options out of it; remove what was made if it stays empty."""
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
     sources = [[str(file.absolute()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
-    return {"sources": sources, "title": options.title, "url": options.url}
+    try:
+        with claimed(folder, "kpshare", {"sources": sources, "title": options.title, "url": options.url}):
+            yield
+    finally:
+        with contextlib.suppress(OSError):  # there are files in it
+            for path in made:
+                path.rmdir()
 
 
 def _parser() -> argparse.ArgumentParser:

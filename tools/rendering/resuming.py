@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import hashlib
 import json
+import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -110,4 +111,5 @@ def _identity(value: Any) -> Any:
 
 
 def _shown(value: Any) -> str:
-    return "none" if value is None else str(value)
+    """Return a value as it is given on the command line: a size as 640x480."""
+    return "none" if value is None else re.sub(r"\((\d+), (\d+)\)", r"\1x\2", str(value))

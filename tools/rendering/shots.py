@@ -113,7 +113,8 @@ def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: boo
             raise UsageError("--frames chooses frames, --from and --to seconds; give only one of both")
         first, last = options.frames
         if last >= timeline.count:
-            raise UsageError(f"--frames {first}-{last}: the last frame is {timeline.count - 1}")
+            asked = f"{first}-{last}" if last > first else f"{first}"
+            raise UsageError(f"--frames {asked}: the last frame is {timeline.count - 1}")
     if options.start_s is not None or options.end_s is not None:
         start_s, end_s = options.start_s or 0.0, options.end_s
         if end_s is not None and end_s > timeline.count / fps + cli.TIME_SLACK_S:
