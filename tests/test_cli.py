@@ -6,7 +6,8 @@ import importlib
 import importlib.metadata
 import os
 import re
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,24 @@ def test_errors_that_users_can_fix_are_one_line(
 def test_bugs_keep_their_traceback(error: Exception, cause: Exception | None) -> None:
     with pytest.raises(type(error)):
         cli.run(raising(error, cause), "kpx", [])
+
+
+@pytest.mark.parametrize("kind", [UsageError, FormatError, KeyboardInterrupt])
+def test_bars_are_closed_before_an_error_is_printed(
+    kind: type[BaseException], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def bar() -> Iterator[int]:
+        try:
+            yield 0
+        finally:
+            print("closed", file=sys.stderr)
+
+    def command(_: list[str]) -> None:
+        for _ in bar():
+            raise kind("bad")
+
+    assert cli.run(command, "kpx", []) > 0
+    assert capsys.readouterr().err.startswith("closed\nkpx: ")
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])

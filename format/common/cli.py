@@ -45,32 +45,37 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # names may hold what the terminal's encoding lacks
+    # Printed when the traceback is gone, and with it what it keeps open, such as bars.
+    failure = ("", 0)
     try:
         with interrupts.heeded(name):
             command(sys.argv[1:] if argv is None else argv)
     except UsageError as error:
-        return _fail(name, str(error), 2)
+        failure = str(error), 2
     except KpcError as error:
-        return _fail(name, str(error), 1)
+        failure = str(error), 1
     except ModuleNotFoundError as error:
         if error.name not in EXTRAS:
             raise
         remedy = f'in a checkout of KPC, pip install ".[{EXTRAS[error.name]}]"'
-        return _fail(name, f"needs {error.name}, which is not installed; {remedy}", 1)
+        failure = f"needs {error.name}, which is not installed; {remedy}", 1
     except (KeyboardInterrupt, SystemError) as error:
         # A Ctrl-C that arrives inside a compiled function surfaces as a SystemError.
         if not any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):
             raise
-        return _fail(name, "interrupted", interrupts.INTERRUPTED)
+        failure = "interrupted", interrupts.INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()  # The reader of the output is gone; Python must not complain on exit.
         return 1
     except OSError as error:
-        message = message_of(error)
-        if message is None:
+        said = message_of(error)
+        if said is None:
             raise
-        return _fail(name, message, 1)
-    return 0
+        failure = said, 1
+    message, code = failure
+    if code:
+        print_error(name, message)
+    return code
 
 
 def message_of(error: KpcError | OSError) -> str | None:
@@ -112,11 +117,6 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 def print_error(name: str, message: str) -> None:
     """Print an error of a command as one line on stderr; line breaks, and what a terminal would obey, as escapes."""
     notice(f"{name}: {message}")
-
-
-def _fail(name: str, message: str, code: int) -> int:
-    print_error(name, message)
-    return code
 
 
 @contextlib.contextmanager

@@ -8,9 +8,11 @@ picture = kpc.render(scene, scene.cameras[0], time=0.5).rgb     # (H, W, 3) floa
 
 import os
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, BinaryIO
 
+TYPE_CHECKING = False  # as in typing, whose import would take longer than all else here, while Ctrl-C ends nothing yet
 if TYPE_CHECKING:
+    from typing import Any, BinaryIO
+
     import numpy as np
 
     from kpc.format.common.errors import KpcError
@@ -31,7 +33,7 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     """Load a name of `_HOMES`."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
