@@ -131,7 +131,7 @@ class Progress:
         else:
             of = "" if self.unit == "%" else f"/{self.total:.0f}"
             parts = [f"{self.label}: {_whole(self.done)}{of} {self.unit}".rstrip()]
-            if self.done > self.counted:
+            if self.done > self.counted and self.total < 100:
                 parts.append(f"{100 * self.done / self.total:.0f} %")
             if (left_s := self._left_s()) is not None:
                 self.line_after_s = LINE_EVERY_S

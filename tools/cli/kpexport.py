@@ -25,7 +25,7 @@ import numpy as np
 import kpc
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
-from kpc.format.common.progress import Progress, in_parts
+from kpc.format.common.progress import Progress, in_parts, part
 from kpc.format.common.text import counted, escaped, notice
 from kpc.format.container.groups import GroupedScene, Groups
 from kpc.format.scene.cameras import Camera, View, save_views
@@ -144,11 +144,15 @@ def _points(loaded: Scene | GroupedScene, render: Render, time: float, options: 
     cameras = Rig.of(scene).cameras
     if options.size is not None:
         cameras = tuple(fit_camera(camera, *options.size) for camera in cameras)
-    cloud = surface_points(((camera, render(camera, time)) for camera in in_parts(cameras)), bounds, spacing)
+    pictures = ((camera, render(camera, time)) for camera in in_parts(cameras))
+    with part(2 / 3 if options.normals else 1):
+        cloud = surface_points(pictures, bounds, spacing)
     if not len(cloud.points):
         raise KpcError(f"{options.input}: its cameras see no surface at time {time:g}; choose another --time")
-    normals = normals_of(scene, local_time, cloud.points) if options.normals else None
-    return Cloud(cloud.points, cloud.colours, normals)
+    if not options.normals:
+        return cloud
+    with part(1 / 3):
+        return Cloud(cloud.points, cloud.colours, normals_of(scene, local_time, cloud.points))
 
 
 def _mesh(loaded: Scene | GroupedScene, time: float, options: argparse.Namespace) -> Mesh:
@@ -178,10 +182,11 @@ def _documents(cameras: Sequence[Camera]) -> list[dict[str, Any]]:
 
 def _exchange_cameras(task: Task, options: argparse.Namespace) -> None:
     """Write cameras of the player for other programs, or the reverse."""
+    source, output = Path(options.input), Path(options.output)
+    source.stat()  # before anything is said of a file that is not there
     placement = Placement.of(None if options.scene is None else Groups(options.scene).metadata())
     if options.scene is None:
         _say("without --scene, coordinates are kept: y counts as up and a unit as a metre")
-    source, output = Path(options.input), Path(options.output)
     if task.kind == "to":
         fps = float(options.fps or PATH_FPS)
         tracks = placed(load_tracks(source, None if options.keyframes else fps), placement)

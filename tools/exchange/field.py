@@ -68,7 +68,7 @@ def density_gradients(scene: Scene, time: float, points: np.ndarray) -> np.ndarr
     moment = SceneAtTime.of(scene, time)
     reach = GRADIENT_REACH * float((scene.bounds[1] - scene.bounds[0]).max())
     slopes = []
-    for axis in np.eye(3):
+    for axis in in_parts(tuple(np.eye(3))):
         ahead, behind = (plane_coordinates(scene, points + sign * reach * axis) for sign in (1, -1))
         slopes.append((densities(scene, moment, ahead) - densities(scene, moment, behind)) / (2 * reach))
     return np.stack(slopes, axis=1).astype(np.float64)
