@@ -66,7 +66,7 @@ class Options:
     decoder: str = "explicit"
     sampling: str = "grid"
     progressive: bool = False
-    layers: str = "one"
+    layers: str = "auto"
     steps: int | None = None
     time_budget_s: float | None = None
     seed: int = 0

@@ -248,7 +248,7 @@ def test_pruning_is_logged_and_reduces_the_file(
 ) -> None:
     """After 24 steps hardly anything gains a decibel; the loss that is reported counts all that coding costs."""
     monkeypatch.setitem(PRESETS, "draft", replace(TINY, prune_share=share))
-    code, out, err = run(sets / "n3dv", "--max-loss", "1dB", "--holdout", "none", "--json")
+    code, out, err = run(sets / "n3dv", "--layers", "one", "--max-loss", "1dB", "--holdout", "none", "--json")
     scene = scene_io.read(tmp_path / "out.kpc")
     counts = [scale["xy"].symbols.shape[2] for scale in scene.scales]
     assert code == 0 and json.loads(out)["coding_loss_db"] <= 1
