@@ -186,7 +186,7 @@ def find_layers(
     if options.layers == "one":
         return Layers()
     area, why = None, "nothing moves"
-    if config.motion_cells or config.summed:
+    if config.motion_cells or config.summed or not config.moving_texels:
         why = "the model is of another kind"
     elif dataset.is_dynamic:
         area, why = find_moving_area(dataset, aabb, mapping)

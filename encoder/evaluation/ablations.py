@@ -31,6 +31,8 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "uniform ray sampling": lambda c: replace(c, temporal_start=1.0, object_rays=0.0),
     "no appearances": lambda c: replace(c, appearance="none"),
     "no motion grid": lambda c: replace(c, motion_cells=0),
+    "what moves in all scales": lambda c: c if c.motion_cells else replace(c, moving_texels=0.0),
+    "no steps of whole lines": lambda c: c if c.motion_cells else replace(c, line_rate=0.0),
     "planes summed": lambda c: replace(c, summed=True, sparse_transients=0.0),
     "hybrid decoder": lambda c: replace(c, hybrid=True),
     "the preset's time rows": lambda c: replace(c, time_tolerance=0.0),

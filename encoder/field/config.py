@@ -54,7 +54,8 @@ class TrainConfig:
     # `resolutions` then makes two scales: one without space-time planes, and one with them that holds nothing outside
     # the area (`kpc.encoder.training.moving_area`). None: scales of six planes that cover everything.
     moving_area: tuple[float, ...] | None = None
-    # Texels of such a scale along the longest edge of the area, as a share of those of the other along that of the box.
+    # Texels of such a scale along the longest edge of the area, as a share of those of the other along that of the box;
+    # 0: no such scales.
     moving_texels: float = 0.6
     # Its rows in time, at most one for each frame, as a multiple of what `frames_per_row` gives.
     moving_rows: float = 2.0
