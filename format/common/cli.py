@@ -206,13 +206,13 @@ def check_writable(path: Path, *, is_folder: bool = False, option: str = "-o") -
         above = above.parent
     while is_folder and not os.path.lexists(above) and above != above.parent:
         above = above.parent
-    shown = path if above == path.absolute() else above
+    shown = next((one for one in (path, *path.parents) if one.absolute() == above), above)
     if above.exists() and not above.is_dir():
         raise UsageError(f"{shown}: is a file, not a folder; give another name")
     if above.is_symlink() and not above.exists():
         raise UsageError(f"{shown}: is a link that leads nowhere; give another name")
     if not above.is_dir():
-        raise UsageError(f"{above}: no such folder; make it first, or choose another place with {option}")
+        raise UsageError(f"{shown}: no such folder; make it first, or choose another place with {option}")
     if not os.access(above, os.W_OK):
         raise OSError(errno.EACCES, f"no permission to write there; choose another place with {option}", str(path))
 

@@ -232,6 +232,8 @@ def test_files_that_cannot_be_coded_are_refused_before_anything_starts(
     said = capsys.readouterr().err.splitlines()
     assert [line.split(": ")[1] for line in said] == [names[0], names[1], names[3]]
     assert "nor a .kpc file" in said[0] and "cut off at" in said[1] and "is a pipe" in said[2]
+    assert said[1].count("cut.kpc") == 1
+    assert main([names[2], "-o", str(tmp_path / "out"), "--dry-run"]) == 0 and not (tmp_path / "out").exists()
 
 
 def test_an_address_follows_content_options_and_group(take: Path) -> None:

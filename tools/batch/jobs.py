@@ -295,7 +295,7 @@ def _checked(job: Job, faults: Faults) -> Job:
         message = said.getvalue().strip().rsplit("error: ", 1)[-1]
         faults.add(job.where, message if stop.code else f"--help and --version: {A_BATCHS_OWN}")
     except (KpcError, OSError) as error:
-        faults.add(job.where, cli.message_of(error) or str(error))
+        faults.add(job.where, (cli.message_of(error) or str(error)).removeprefix(f"{job.source}: "))
     return job
 
 

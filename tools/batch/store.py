@@ -35,8 +35,8 @@ def reason(error: Exception) -> str:
 class Store:
     """Files below a folder or an address. What is written appears whole or not at all."""
 
-    def __init__(self, address: str) -> None:
-        """Open the place, and make it if it is a folder.
+    def __init__(self, address: str, *, make: bool = True) -> None:
+        """Open the place, and make it if it is a folder and `make` is true; nothing is in a folder that is not there.
 
         Raises:
             StoreError: the address is of an unknown kind, or the folder cannot be made.
@@ -45,7 +45,8 @@ class Store:
         try:
             self._fs, self._root = fsspec.core.url_to_fs(address)
             self._is_local = "file" in self._fs.protocol
-            self._fs.makedirs(self._root, exist_ok=True)
+            if make:
+                self._fs.makedirs(self._root, exist_ok=True)
         except Exception as error:
             raise StoreError(f"{address}: {reason(error)}") from error
 

@@ -56,7 +56,7 @@ def _command(argv: list[str]) -> None:
         if place is not None and not ADDRESS.match(place):
             cli.check_writable(Path(place), is_folder=True, option=option)
     shared = f"{batch.output.rstrip('/')}/{SHARED}"
-    store, output = Store(shared), Store(batch.output)
+    store, output = (Store(place, make=not options.dry_run) for place in (shared, batch.output))
     check_report(output)
     first, known = first_tasks(batch.jobs), done_before(store)
     if options.dry_run:
