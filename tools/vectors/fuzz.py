@@ -396,6 +396,8 @@ def _work(
         if k % REPORT_EVERY == REPORT_EVERY - 1 or number == numbers[-1]:
             pipe.send((number + numbers.step, tally, findings))
             tally, findings = Counter(), []
+    if reader is not None:
+        reader.close()
 
 
 def _limit_memory(more_bytes: int) -> None:
