@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from kpc.encoder.coding.scene_writer import write
@@ -12,6 +13,7 @@ from kpc.format.container import groups
 from kpc.format.container.container import Reader
 from kpc.format.container.scene_io import read
 from kpc.format.scene.cameras import View, save_views
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.rig import Rig
 from kpc.tools.cli import kpedit, kpinfo
 from scenes import tiny_scene
@@ -102,6 +104,33 @@ def test_view_limits_are_found_and_set_and_taken_away(folder):
     assert changed.document["view_limits"] == {**found.document["view_limits"], "azimuth": [-3, 4.5], "reach": 0}
     none = read(edit(folder, "--view-limits", "none", scene="limited.kpc")).metadata
     assert none == found.with_members(view_limits=None)
+
+
+def test_view_limits_are_found_again_about_another_up(folder, capsys):
+    limited = edit(folder, "--view-limits", "auto").rename(folder / "limited.kpc")
+    before = read(limited).metadata
+    longer = ",".join(str(2 * number) for number in before.document["up"])
+    same = read(edit(folder, f"--up={longer}", scene=limited.name)).metadata
+    assert same.view_limits.elevation == before.view_limits.elevation and "view limits" not in capsys.readouterr().err
+    tilted = Rig.of(read(limited).dequantise()).compass()[1] * 0.5 + before.up  # towards the side
+    words = [f"--up={','.join(map(str, tilted))}"]
+    after = read(edit(folder, *words, scene=limited.name)).metadata
+    assert "and they are found again" in capsys.readouterr().err
+    assert after.opening.camera.fl_x == before.opening.camera.fl_x and after.document["up"] == tilted.tolist()
+    auto = read(edit(folder, *words, "--view-limits", "auto", scene=limited.name)).metadata
+    assert auto.document["view_limits"] == after.document["view_limits"] != before.document["view_limits"]
+    eye = read(limited).cameras[0].camera_to_world[:3, 3] - after.view_limits.focus
+    height = np.degrees(np.arcsin(eye @ after.up / np.linalg.norm(eye)))
+    low, high = after.document["view_limits"]["elevation"]
+    assert low <= height <= high
+
+
+def test_view_limits_that_cannot_be_found_again_are_left_out(folder, capsys):
+    limits = {"focus": [0, 0, 0], "forward": [0, 1, 0], "azimuth": [-9, 9], "elevation": [0, 9], "distance": [1, 2]}
+    members = {"up": [0, 0, 1], "view_limits": limits | {"reach": 1}}
+    save(replace(small_scene(), metadata=Metadata(members)), folder / "two.kpc")
+    assert "view_limits" not in read(edit(folder, "--up", "0,1,0", scene="two.kpc")).metadata.document
+    assert "none are found about the new one" in capsys.readouterr().err
 
 
 def test_a_saved_view_opens_the_scene(folder):

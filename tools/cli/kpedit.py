@@ -19,6 +19,7 @@ import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,9 @@ from kpc.player.cpu import reference
 from kpc.tools.editing.clips import Edits, edit
 from kpc.tools.editing.placing import Placement, axis_turn
 from kpc.tools.editing.timing import MAX_FPS, MIN_FPS
+
+# Unit vectors that differ by no more than this are one direction: a file holds seven digits.
+SAME_DIRECTION = 1e-5
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -199,14 +203,8 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement:
         members["metres_per_unit"] = options.metres_per_unit * (1.0 if placement is None else placement.factor)
     if options.transparent is not None:
         members["transparent"] = options.transparent or None
-    metadata = metadata.with_members(**members)
-    if options.view_limits is not None:
-        is_found = options.view_limits != "none" and (
-            options.view_limits == "auto" or "view_limits" not in metadata.document
-        )
-        metadata = _with_found_view(metadata, options.scene) if is_found else metadata
-        if options.view_limits != "auto":
-            metadata = with_view_limits(metadata, options.view_limits)
+    is_upright = _has_direction(metadata.up, members.get("up"))
+    metadata = _with_limits(metadata.with_members(**members), options, is_upright)
     if options.open_at is not None:
         view = load_views(options.open_at)[0]
         metadata = metadata.with_members(opening={"camera": camera_document(view.camera), "time": view.time})
@@ -222,25 +220,60 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement:
     return metadata
 
 
-def _with_found_view(metadata: Metadata, path: Path) -> Metadata:
-    """Return the metadata with an opening view, limits and up found from what the cameras of the scene see.
+def _has_direction(up: np.ndarray | None, wanted: Sequence[float] | None) -> bool:
+    """Return whether a unit vector `up` has the direction that is wanted; True where none is."""
+    if up is None or wanted is None:
+        return wanted is None
+    return bool(np.linalg.norm(up - np.array(wanted) / np.linalg.norm(wanted)) < SAME_DIRECTION)
+
+
+def _with_limits(metadata: Metadata, options: argparse.Namespace, is_upright: bool) -> Metadata:
+    """Return metadata with the view limits that the options ask for.
+
+    Limits are angles about `up`: where that changes, those of the file are found again, or left out.
+
+    Args:
+        metadata: with the new `up`.
+        options: of the command line.
+        is_upright: whether `up` is what it was.
 
     Raises:
-        UsageError: too few cameras are known, or they do not look at one place.
+        UsageError: limits are asked for, and none are found.
+    """
+    wanted = options.view_limits
+    is_lost = not is_upright and "view_limits" in metadata.document
+    if wanted == "none" or (wanted is None and not is_lost):
+        return metadata if wanted is None else with_view_limits(metadata, wanted)
+    if wanted is None:
+        limits = _found_view(metadata, options.scene).get("view_limits")
+        what = "none are found about the new one: they are left out" if limits is None else "they are found again"
+        notice(f"kpedit: --up: the view limits were angles about the former up, and {what}")
+        return metadata.with_members(view_limits=limits)
+    if wanted == "auto" or is_lost or "view_limits" not in metadata.document:
+        found = _found_view(metadata, options.scene)
+        if "view_limits" not in found:
+            raise UsageError(
+                f"{options.scene}: no view limits are found: they need three cameras that look at one place and see "
+                "what the first of them sees; give --view-limits none"
+            )
+        metadata = metadata.with_members(**found)
+    return metadata if wanted == "auto" else with_view_limits(metadata, wanted)
+
+
+def _found_view(metadata: Metadata, path: Path) -> Mapping[str, Any]:
+    """Return an opening view, limits about the `up` of the metadata, and up where these have none, as members.
+
+    They are found from what the cameras of the scene see; there are no limits where these do not look at one place.
     """
     scene, time = load(path).at(0.5)
+    scene = replace(scene, metadata=metadata)
 
     def look(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         seen = reference.render_rays(scene, *camera.rays(), time)
         return seen.depth, seen.opacity
 
-    found: Mapping[str, Any] = view_members(scene, *find_view(scene, look))
-    if "view_limits" not in found:
-        raise UsageError(
-            f"{path}: no view limits are found: they need three cameras that look at one place and see what the first "
-            "of them sees; give --view-limits none"
-        )
-    return metadata.with_members(**found)
+    found = view_members(scene, *find_view(scene, look))
+    return {name: value for name, value in found.items() if name != "up" or "up" not in metadata.document}
 
 
 def _json_object(path: Path) -> dict[str, Any]:
