@@ -152,15 +152,17 @@ def check_folder(folder: Path, wanted: Mapping[str, Path | bytes]) -> None:
             equal, or as the page of the folder records that they were written.
 
     Raises:
-        UsageError: a page or a file would be replaced.
+        UsageError: a page that was changed, a page of others, or a file would be replaced.
     """
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder}: is a file, not a folder, and stays; choose another folder with -o")
     page, text = folder / PAGE, ""
     if page.exists():
-        text = page.read_text(errors="replace") if page.is_file() else ""
+        text = _text_of(page)
         if GENERATOR not in text:
             raise UsageError(f"{page}: is not a page of kpshare and stays; choose another folder with -o")
+        if not _is_unchanged(text):
+            raise UsageError(f"{page}: was changed after kpshare wrote it, and stays; choose another folder with -o")
     written = _recorded(text)
     for name, content in wanted.items():
         path = folder / name
@@ -169,14 +171,29 @@ def check_folder(folder: Path, wanted: Mapping[str, Path | bytes]) -> None:
 
 
 def with_record(page: str, written: Mapping[str, Path | bytes]) -> str:
-    """Return a page that records what was written beside it, so that only this is replaced later.
+    """Return a page that records itself and what was written beside it, so that only this is replaced later.
 
     Args:
         page: markup of a page of this module.
         written: the files, by their names, which are those of `file_name`.
     """
     listed = " ".join(f"{name}={_checksum(content)}" for name, content in written.items())
-    return page.replace(GENERATOR, GENERATOR + "\n" + Template(RECORD).substitute(files=listed), 1)
+
+    def recording(files: str) -> str:
+        return page.replace(GENERATOR, GENERATOR + "\n" + Template(RECORD).substitute(files=files), 1)
+
+    return recording(f"{listed} {PAGE}={_checksum(recording(listed).encode())}")
+
+
+def _text_of(page: Path) -> str:
+    """Return the text of a page with its line ends, empty if it is no file."""
+    return page.read_bytes().decode(errors="replace") if page.is_file() else ""
+
+
+def _is_unchanged(page: str) -> bool:
+    """Return whether a page is as it was written; one of an older version, which does not record itself, counts so."""
+    own = _recorded(page).get(PAGE)
+    return own is None or own == _checksum(page.replace(f" {PAGE}={own}", "", 1).encode())
 
 
 def own_files(folder: Path, wanted: Mapping[str, Path | bytes]) -> dict[str, Path | bytes]:
@@ -189,8 +206,7 @@ def own_files(folder: Path, wanted: Mapping[str, Path | bytes]) -> dict[str, Pat
         folder: that is to be written, and is not yet.
         wanted: what is to be written, by names: files of the user as paths, all else as bytes.
     """
-    page = folder / PAGE
-    written = _recorded(page.read_text(errors="replace")) if page.is_file() else {}
+    written = _recorded(_text_of(folder / PAGE))
 
     def is_own(name: str, content: Path | bytes) -> bool:
         path = folder / name
