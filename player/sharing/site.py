@@ -3,10 +3,11 @@
 All addresses in the pages are relative, so that the folder may lie anywhere on any static web host.
 """
 
+import contextlib
 import hashlib
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -175,7 +176,7 @@ def with_record(page: str, written: Mapping[str, Path | bytes]) -> str:
 
     Args:
         page: markup of a page of this module.
-        written: the files, by their names, which are those of `file_name`.
+        written: the files, by their names, which are those of `file_name`, or such in a folder of such a name.
     """
     listed = " ".join(f"{name}={_checksum(content)}" for name, content in written.items())
 
@@ -215,6 +216,46 @@ def own_files(folder: Path, wanted: Mapping[str, Path | bytes]) -> dict[str, Pat
         return name in written and not path.samefile(content)
 
     return {name: content for name, content in wanted.items() if is_own(name, content)}
+
+
+def remove_left(folder: Path, written: Collection[Path], sources: Sequence[Path]) -> list[str]:
+    """Remove the files that pages of a folder record and that are not written again, such as of a scene that has left.
+
+    Args:
+        folder: that is to be written, and is not yet.
+        written: all files that are to be written.
+        sources: files that are read, which stay.
+
+    Returns:
+        A line for each file, or folder of a scene, that was removed, and for each file that stays.
+    """
+    unchanged, others = _left(folder, written, sources)
+    for path in unchanged:
+        path.unlink()
+    places = dict.fromkeys(path if path.parent == folder else path.parent for path in unchanged)
+    for place in places:
+        with contextlib.suppress(OSError):  # other files are in it
+            place.rmdir()
+    why = "is no longer shared; it stays, since it was changed or is a scene to read"
+    return [f"{place}: is no longer shared, so removed" for place in places] + [f"{path}: {why}" for path in others]
+
+
+def _left(folder: Path, written: Collection[Path], sources: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Return the files that `remove_left` may remove, and those that stay."""
+    unchanged: list[Path] = []
+    others: list[Path] = []
+    for name, checksum in _recorded(_text_of(folder / PAGE)).items():
+        path, parts = folder / name, name.split("/")
+        is_of_site = name != PAGE and len(parts) < 3 and all(part == file_name(part) for part in parts)
+        if not is_of_site or path in written or not path.is_file():
+            continue
+        if _checksum(path) != checksum or any(path.samefile(source) for source in sources):
+            others.append(path)
+            continue
+        below = _left(path.parent, written, sources) if len(parts) == 2 else ([], [])  # that of a gallery's scene
+        unchanged += [*below[0], path]
+        others += below[1]
+    return unchanged, others
 
 
 def _recorded(page: str) -> dict[str, str]:

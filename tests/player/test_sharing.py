@@ -198,6 +198,28 @@ def test_a_page_that_was_changed_stays(tmp_path: Path, quick_posters: None, caps
         page.write_bytes(written)
 
 
+def test_what_is_no_longer_shared_is_removed_unless_it_was_changed(
+    tmp_path: Path, quick_posters: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenes, folder = tmp_path / "scenes", tmp_path / "site"
+    scenes.mkdir()
+    for name in ("a", "b", "c"):
+        shutil.copy(SAMPLE, scenes / f"{name}.kpc")
+    assert kpshare.main(["--gallery", str(scenes), "-o", str(folder)]) == 0
+    (folder / "b" / "poster.jpg").write_bytes(b"mine")
+    (folder / "mine").write_bytes(b"mine")
+    again = [str(scenes / "c.kpc"), "-o", str(folder)]
+    assert kpshare.main([str(scenes / "a.kpc"), *again]) == 0
+    assert f"{folder / 'b' / 'poster.jpg'}: is no longer shared; it stays" in capsys.readouterr().err
+    assert [path.name for path in (folder / "b").iterdir()] == ["poster.jpg"]
+    assert kpshare.main(again) == 0
+    assert f"{folder / 'a'}: is no longer shared, so removed" in capsys.readouterr().err
+    found = {path.name for path in folder.iterdir()}
+    assert found == {"b", "c.kpc", "index.html", "kpc-player.js", "kpc-worker.js", "mine", "page.css", "poster.jpg"}
+    assert kpshare.main([str(folder / "c.kpc"), str(scenes / "a.kpc"), "-o", str(folder)]) == 0
+    assert (folder / "c.kpc").exists() and "c.kpc: is no longer shared; it stays" in capsys.readouterr().err
+
+
 def test_a_scene_that_lay_in_the_folder_is_never_replaced(
     tmp_path: Path, quick_posters: None, capsys: pytest.CaptureFixture[str]
 ) -> None:

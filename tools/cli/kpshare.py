@@ -22,7 +22,7 @@ from kpc.format.common import cli
 from kpc.format.common.errors import NetworkError, UsageError
 from kpc.format.common.images import write_image
 from kpc.format.common.progress import progress
-from kpc.format.common.text import counted, escaped
+from kpc.format.common.text import counted, escaped, notice
 from kpc.format.container.http_address import Address, public_name
 from kpc.player.app.playlist import Playlist
 from kpc.player.sharing import site
@@ -67,7 +67,12 @@ def _command(argv: list[str]) -> None:
         for wanted, poster in zip(beside, posters, strict=True):
             wanted[site.POSTER] = poster.read_bytes()
         check()  # again, with the posters
+        written = [folder / name for name in (*player, site.PAGE)]
+        written += [place / name for place, names in zip(folders, beside, strict=True) for name in (*names, site.PAGE)]
+        for line in site.remove_left(folder, written, files):
+            notice(f"kpshare: {line}")
         site.copy_player(folder)
+        pages: dict[str, Path | bytes] = {}
         for (name, scene), place, wanted in zip(scenes.items(), folders, beside, strict=True):
             place.mkdir(exist_ok=True)
             own = site.own_files(place, {**at_page, **wanted})
@@ -76,10 +81,11 @@ def _command(argv: list[str]) -> None:
             url = None if options.url is None else urljoin(options.url, f"{name}/" if is_gallery else "")
             page = site.scene_page(scene, root=root, url=url)
             site.write_file(place / site.PAGE, site.with_record(page, own))
+            pages[f"{name}/{site.PAGE}"] = place / site.PAGE
         if is_gallery:
             title = options.title or (options.gallery or folder).absolute().name
             page = site.gallery_page(scenes, title, options.url)
-            site.write_file(folder / site.PAGE, site.with_record(page, player))
+            site.write_file(folder / site.PAGE, site.with_record(page, {**player, **pages}))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     what = f"{counted(len(files), 'scene')}, {size:,} bytes"
     print(escaped(f"{folder / site.PAGE}: {what}; put {folder} on a web host"))
