@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import re
 import shutil
+import unicodedata
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -30,7 +31,7 @@ PLAYER_FILES = ("kpc-player.js", "kpc-worker.js")
 # How pages written by this module are recognised: only they are replaced, and the files that they record.
 GENERATOR = '<meta name="generator" content="kpshare">'
 RECORD = '<meta name="kpshare-files" content="$files">'
-PAGE, POSTER = "index.html", "poster.jpg"
+PAGE, POSTER, STYLE = "index.html", "poster.jpg", "page.css"
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ def player_files() -> dict[str, bytes]:
     """Return the player and the style sheet of the pages, by their names beside the pages."""
     built = files("kpc.player") / "web" / "dist"
     found = {name: (built / name).read_bytes() for name in PLAYER_FILES}
-    return found | {"page.css": (files(__package__) / "page.css").read_bytes()}
+    return found | {STYLE: (files(__package__) / STYLE).read_bytes()}
 
 
 def copy_player(folder: Path) -> None:
@@ -292,13 +293,24 @@ def copy_file(source: Path | bytes, target: Path) -> None:
 
 
 def file_name(name: str) -> str:
-    """Return a name like this one that every web host can serve: letters, digits, dots, dashes and underlines."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "scene"
+    """Return a name like this one that every web host can serve: letters, digits, dots, dashes and underlines.
+
+    A name that loses letters of other scripts ends in a part of its SHA-256, so that the address of a scene does not
+    depend on which others are shared.
+    """
+    name = unicodedata.normalize("NFC", name)  # macOS takes letters and their accents apart
+    found = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "scene"
+    if name.isascii():
+        return found
+    return f"{found}-{_checksum(name.encode(errors='surrogateescape'))[:8]}"
 
 
 def distinct_names(names: Sequence[str]) -> list[str]:
-    """Return names for files or folders of a site, none of which differs from another by capitals alone."""
-    taken: set[str] = set()
+    """Return names for files or folders of a site, none of which differs from another by capitals alone.
+
+    None is that of a file that lies beside them.
+    """
+    taken = {PAGE, POSTER, STYLE, *PLAYER_FILES}
     found = []
     for name in map(file_name, names):
         candidate, number = name, 1

@@ -90,7 +90,8 @@ def test_a_published_address_makes_link_previews_whole() -> None:
     ("names", "wanted"),
     [
         (["a", "A", "b"], ["a", "A-2", "b"]),
-        (["zwei Köpfe", "..", "con/../x"], ["zwei-K-pfe", "scene", "con-..-x"]),
+        (["zwei Köpfe", "..", "con/../x"], ["zwei-K-pfe-9099442b", "scene", "con-..-x"]),
+        (["index.html", "Page.css", "kpc-player.js"], ["index.html-2", "Page.css-2", "kpc-player.js-2"]),
         (["a", "a", "a-2"], ["a", "a-2", "a-2-2"]),
     ],
 )
@@ -98,16 +99,27 @@ def test_names_suit_every_host(names: list[str], wanted: list[str]) -> None:
     assert site.distinct_names(names) == wanted
 
 
+def test_the_address_of_a_scene_does_not_depend_on_others() -> None:
+    both = site.distinct_names(["日本", "動画"])
+    assert both == [*site.distinct_names(["日本"]), *site.distinct_names(["動画"])]
+    assert site.distinct_names(["Ko\u0308pfe"]) == site.distinct_names(["Köpfe"]), "as macOS writes it, too"
+    assert site.distinct_names(["caf\udce9"])[0].startswith("caf-")
+
+
 def test_one_scene_becomes_one_page(tmp_path: Path, quick_posters: None, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "made" / "site"
     assert kpshare.main([str(SAMPLE), "-o", str(folder)]) == 0
-    assert "<kpc-player" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    size = sum(path.stat().st_size for path in folder.iterdir())
+    assert "<kpc-player" in said and f"1 scene, {size:,} bytes" in said
+    (folder / "mine").write_bytes(b"1")
+    assert kpshare.main([str(SAMPLE), "-o", str(folder)]) == 0 and f"{size:,} bytes" in capsys.readouterr().out
+    (folder / "mine").unlink()
     found = sorted(path.name for path in folder.iterdir())
     assert found == ["default.kpc", "index.html", "kpc-player.js", "kpc-worker.js", "page.css", "poster.jpg"]
     assert (folder / "default.kpc").read_bytes() == SAMPLE.read_bytes()
     page = Page((folder / "index.html").read_text())
     assert all((folder / address).is_file() for address in page.addresses())
-    assert kpshare.main([str(SAMPLE), "-o", str(folder)]) == 0, "a site can be made anew"
 
 
 def test_several_scenes_become_a_gallery(tmp_path: Path, quick_posters: None) -> None:

@@ -67,8 +67,9 @@ def _command(argv: list[str]) -> None:
         for wanted, poster in zip(beside, posters, strict=True):
             wanted[site.POSTER] = poster.read_bytes()
         check()  # again, with the posters
-        written = [folder / name for name in (*player, site.PAGE)]
-        written += [place / name for place, names in zip(folders, beside, strict=True) for name in (*names, site.PAGE)]
+        written = {folder / name for name in (*player, site.PAGE)}
+        for place, wanted in zip(folders, beside, strict=True):
+            written |= {place / name for name in (*wanted, site.PAGE)}
         for line in site.remove_left(folder, written, files):
             notice(f"kpshare: {line}")
         site.copy_player(folder)
@@ -86,7 +87,7 @@ def _command(argv: list[str]) -> None:
             title = options.title or (options.gallery or folder).absolute().name
             page = site.gallery_page(scenes, title, options.url)
             site.write_file(folder / site.PAGE, site.with_record(page, {**player, **pages}))
-    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    size = sum(file.stat().st_size for file in written)
     what = f"{counted(len(files), 'scene')}, {size:,} bytes"
     print(escaped(f"{folder / site.PAGE}: {what}; put {folder} on a web host"))
     if not is_gallery:
