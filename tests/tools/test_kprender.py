@@ -131,7 +131,30 @@ def test_one_picture_of_another_name_is_spoken_of_as_one(run, scene_file: Path, 
     listed = cameras_json(tmp_path / "cameras.json", ["a.png", ".b.png"])
     words = ["--cameras", listed, "--size", "8x6", "--backend", "reference", "-o", tmp_path / "out"]
     code, _, notes = run(scene_file, *words)
-    assert code == 0 and "1 picture gets another name, for its own is taken or no plain file name\n" in notes
+    assert (
+        code == 0
+        and "1 picture gets another name, for its own is taken or no plain file name: '.b.png' becomes b.png\n" in notes
+    )
+
+
+def test_no_picture_has_the_name_of_the_depth_of_another(run, scene_file: Path, tmp_path: Path) -> None:
+    for number, names in enumerate((["a.png", "a_depth.png"], ["a_depth.png", "a.png"])):
+        listed, out = cameras_json(tmp_path / "cameras.json", names), tmp_path / str(number)
+        words = ["--cameras", listed, "--depth", "--size", "8x6", "--backend", "reference", "-o", out]
+        code, _, notes = run(scene_file, *words)
+        stems = {names[0][:-4], f"{names[1][:-4]}_0001"}
+        assert code == 0 and f"'{names[1]}' becomes {names[1][:-4]}_0001.png" in notes
+        assert {path.stem for path in out.glob("*.png")} == stems | {f"{stem}_depth" for stem in stems}
+        depths = {path.stem for path in out.glob("*.png") if b"depth_unit" in path.read_bytes()}
+        assert depths == {f"{stem}_depth" for stem in stems}
+
+
+def test_names_keep_their_spaces(run, scene_file: Path, tmp_path: Path) -> None:
+    listed = cameras_json(tmp_path / "cameras.json", ["left cam/take 1.png", " take 2 .png"])
+    words = ["--cameras", listed, "--size", "8x6", "--backend", "reference", "-o", tmp_path / "out"]
+    code, _, notes = run(scene_file, *words)
+    assert code == 0 and "1 picture gets" in notes  # a space in front would hardly be seen
+    assert {path.name for path in (tmp_path / "out").glob("*.png")} == {"take 1.png", "take 2 .png"}
 
 
 def test_names_and_poses_of_nerfstudio(run, scene_file: Path, tmp_path: Path) -> None:

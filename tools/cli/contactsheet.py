@@ -17,7 +17,7 @@ from kpc.format.common.fidelity import psnr
 from kpc.format.common.images import read_image, write_image
 from kpc.format.common.media_files import is_image
 from kpc.format.common.text import counted, escaped, notice
-from kpc.tools.cli.depth_images import NO_SURFACE, read_depth_levels
+from kpc.tools.cli.depth_images import NO_SURFACE, depth_path, read_depth_levels
 
 # Space between pictures, and height of a caption, in pixels.
 GAP = 6
@@ -56,7 +56,7 @@ def pairs(truth: Path, rendered: Path) -> tuple[list[Pair], list[Path]]:
             the sizes of a pair differ.
     """
     true_files, files = _by_stem(truth), _by_stem(rendered)
-    depths = {f"{stem}_depth" for stem in files}
+    depths = {depth_path(file).stem for file in files.values()}
     files = {stem: file for stem, file in files.items() if stem not in depths}
     found = []
     for stem, file in files.items():
@@ -120,7 +120,7 @@ def _on_white(picture: np.ndarray) -> np.ndarray:
 
 def _depth_levels(picture: Path) -> np.ndarray | None:
     """Return the depth that kprender wrote beside a picture; None if there is none."""
-    file = picture.with_name(f"{picture.stem}_depth.png")
+    file = depth_path(picture)
     return read_depth_levels(file) if file.is_file() else None
 
 

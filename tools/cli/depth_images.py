@@ -14,6 +14,11 @@ from kpc.format.common import cli
 NO_SURFACE = 65535
 
 
+def depth_path(picture: Path) -> Path:
+    """Return where the depth of a picture lies."""
+    return picture.with_name(f"{picture.stem}_depth.png")
+
+
 def write_depth(
     path: Path,
     depth: np.ndarray,  # (H, W) float, infinite where there is no surface

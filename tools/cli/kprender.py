@@ -30,7 +30,7 @@ from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.common.films import FilmFormat, write_film
 from kpc.format.common.progress import progress
-from kpc.format.common.text import counted, escaped, notice
+from kpc.format.common.text import NAMES_SHOWN, counted, escaped, notice
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Part, Rendering
 from kpc.tools.rendering import pictures, resuming
@@ -180,11 +180,14 @@ def _write_pictures(
     unit = None
     if options.depth:
         unit = pictures.depth_unit(scene, [shots.camera(number) for number in shots.numbers])
-    paths, renamed = output.picture_paths([shots.name(number) for number in shots.numbers])
+    names = [shots.name(number) for number in shots.numbers]
+    paths, renamed = output.picture_paths(names, options.depth and output.suffix != ".exr")
     if renamed:
         one, more = "gets another name, for its own is", "get other names, for theirs are"
-        what = f"{one} taken or no plain file name" if renamed == 1 else f"{more} taken or no plain file names"
-        _say(f"{options.cameras}: {counted(renamed, 'picture')} {what}")
+        what = f"{one} taken or no plain file name" if len(renamed) == 1 else f"{more} taken or no plain file names"
+        now = ", ".join(f"{name!r} becomes {new}" for name, new in renamed[:NAMES_SHOWN])
+        now += ", ..." if len(renamed) > NAMES_SHOWN else ""
+        _say(f"{options.cameras}: {counted(len(renamed), 'picture')} {what}: {now}")
     wanted = list(zip(shots.numbers, paths, strict=True))
     with contextlib.ExitStack() as alone:
         if output.is_folder:

@@ -10,6 +10,7 @@ from pathlib import Path
 from kpc.format.common.errors import UsageError
 from kpc.format.common.films import DEFAULT_CODECS
 from kpc.format.common.media_files import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from kpc.tools.cli.depth_images import depth_path
 
 FILM_SUFFIXES = tuple(DEFAULT_CODECS)
 PICTURE_FORMATS = ("png", "jpg", "exr")
@@ -64,27 +65,37 @@ class Output:
             raise UsageError(f"-o {text}: is a folder; give another name, or {text}/ for pictures in it")
         return Output(path, suffix, is_film=suffix in FILM_SUFFIXES)
 
-    def picture_paths(self, names: Sequence[str]) -> tuple[list[Path], int]:
-        """Return the path of each picture, and how many could not keep their names.
+    def picture_paths(self, names: Sequence[str], with_depth: bool) -> tuple[list[Path], list[tuple[str, str]]]:
+        """Return the path of each picture, and the new names of those that could not keep theirs.
 
         Camera files may come from anywhere: only the last part of their names is used, or all of them joined where that
-        part is there twice.
+        part is there twice. No picture has the name of another's depth.
+
+        Args:
+            names: of the pictures, as the camera file lists them.
+            with_depth: whether the depth of each picture goes beside it.
         """
         if not self.is_folder:
-            return [self.path], 0
+            return [self.path], []
         bare = [re.split(r"[/\\]", _without_suffix(name))[-1] for name in names]
         repeated = {stem for stem, count in Counter(map(_plain, bare)).items() if count > 1}
-        paths, used, renamed = [], set[str](), 0
+        paths, used, renamed = [], set[str](), list[tuple[str, str]]()
         for number, name in enumerate(names):
             stem = _plain(bare[number])
             if stem in repeated:  # none keeps it, else the pictures of one folder would pass for those of another
                 stem = _plain(_without_suffix(name))
-            if not stem or stem in used:
-                stem = f"{number:04d}" if not stem else f"{stem}_{number:04d}"
-            used.add(stem)
-            renamed += stem != bare[number]
+            stem = stem or f"{number:04d}"
+            while used & (taken := self._stems(stem, with_depth)):
+                stem = f"{stem}_{number:04d}"
+            used |= taken
             paths.append(self.path / f"{stem}{self.suffix}")
+            if stem != bare[number]:
+                renamed.append((name, paths[-1].name))
         return paths, renamed
+
+    def _stems(self, stem: str, with_depth: bool) -> set[str]:
+        """Return the names without suffix of a picture and, if it is wanted, its depth."""
+        return {stem, depth_path(Path(f"{stem}{self.suffix}")).stem} if with_depth else {stem}
 
 
 def _without_suffix(name: str) -> str:
@@ -92,8 +103,8 @@ def _without_suffix(name: str) -> str:
 
 
 def _plain(name: str) -> str:
-    """Return a name of letters, digits and some signs, which is no path and not hidden."""
-    return re.sub(r"[^\w.+-]", "_", name)[-120:].lstrip(".")
+    """Return a name of letters, digits, spaces and some signs, which is no path, not hidden, and begins visibly."""
+    return re.sub(r"[^\w.+ -]", "_", name)[-120:].lstrip(". ")
 
 
 def _is_of_media(name: str) -> bool:

@@ -18,7 +18,7 @@ from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction
 from kpc.player.cpu.reference import Rendering
-from kpc.tools.cli.depth_images import NO_SURFACE, write_depth
+from kpc.tools.cli.depth_images import NO_SURFACE, depth_path, write_depth
 from kpc.tools.rendering.content import linear_colours, straight_colours
 
 # Depth PNGs of contracted scenes reach this many times `Contraction.uniform_distance`: 16 bits could not resolve near
@@ -76,11 +76,6 @@ def _without_stderr() -> Iterator[None]:
     finally:
         os.dup2(kept, 2)
         os.close(kept)
-
-
-def depth_path(path: Path) -> Path:
-    """Return where the depth of a picture goes."""
-    return path.with_name(f"{path.stem}_depth.png")
 
 
 def _write_exr(path: Path, picture: Rendering, is_transparent: bool) -> None:
