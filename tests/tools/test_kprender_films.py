@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import kpc
 from kpc.format.common.errors import MediaError, UsageError
@@ -293,7 +294,7 @@ def test_resuming_tells_black_from_transparent(run: Run, scene_file: Path, tmp_p
     words = [scene_file, *SIZE, "--frames", "0-0", "--resume", "-o", tmp_path / "out"]
     assert run(*words, "--background", "black")[0] == 0
     code, _, printed = run(*words, "--background", "transparent")
-    assert code == 2 and "([0.0, 0.0, 0.0], now transparent)" in printed
+    assert code == 2 and "(#000000, now transparent)" in printed
 
 
 def test_pictures_of_other_options_are_never_taken_for_finished(run: Run, scene_file: Path, tmp_path: Path) -> None:
@@ -304,6 +305,23 @@ def test_pictures_of_other_options_are_never_taken_for_finished(run: Run, scene_
     assert code == 2 and "another value of --background (various, now" in printed
     assert run(*words, "--frames", "0-1", "--background", "black")[0] == 0
     assert run(*words, "--frames", "0-2", "--background", "black", "--resume")[0] == 0
+
+
+def test_pictures_that_lay_in_a_folder_before_are_never_taken_for_finished(
+    run: Run, scene_file: Path, tmp_path: Path
+) -> None:
+    out, words = tmp_path / "out", [scene_file, *SIZE, "-o", tmp_path / "out"]
+    out.mkdir()
+    for name in ("0001.png", "0003.png"):
+        Image.new("RGB", (16, 12), "red").save(out / name)
+    for frames in ("0-1", "0-0"):  # the second run remembers what the first one found
+        assert run(*words, "--frames", frames)[0] == 0
+    code, _, said = run(*words, "--frames", "0-3", "--resume")
+    assert code == 2 and "0003.png was there before kprender" in said
+    assert run(*words, "--frames", "0-2", "--resume")[0] == 0
+    (out / "0003.png").unlink()
+    code, printed, _ = run(*words, "--frames", "0-3", "--resume")
+    assert code == 0 and "4 pictures (3 were there)" in printed
 
 
 def test_what_a_run_replaces_is_deleted_before(

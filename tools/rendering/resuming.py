@@ -20,6 +20,8 @@ RECORD = "kprender.json"
 # Options that do not change what a picture shows: they choose pictures, or concern other outputs. A picture of another
 # format is another file.
 FREE = {"output", "resume", "start_s", "end_s", "frames", "step", "format", "codec", "crf", "bits"}
+# The member of the record that lists pictures that lay in the folder before kprender rendered into it.
+UNKNOWN = "pictures of unknown origin"
 CHECKSUM = "SHA-256 "
 PICTURES = {".png", ".jpg", ".jpeg", ".exr"}
 # Options whose name on the command line differs from that of their value.
@@ -33,7 +35,8 @@ def rendering(
     """Note in a folder what its pictures show, before the first one is rendered, and keep it from other pictures.
 
     Without `--resume`, pictures of other options that are to be replaced are deleted first, so that a later `--resume`
-    does not take them for finished; where others stay, the folder is noted to hold pictures of various options.
+    does not take them for finished, and so are those that lay there before the first run; where others stay, the folder
+    is noted to hold pictures of various options, or of unknown origin.
 
     Args:
         folder: the folder of the pictures.
@@ -55,6 +58,8 @@ def rendering(
 
 def _begin(folder: Path, options: argparse.Namespace, now: dict[str, Any], paths: Collection[Path]) -> None:
     record = folder / RECORD
+    names = {path.name for path in paths}
+    unknown: set[str] = set()
     if record.is_file():
         try:
             before = dict(json.loads(record.read_text()))
@@ -70,18 +75,33 @@ def _begin(folder: Path, options: argparse.Namespace, now: dict[str, Any], paths
                 f"--resume: the pictures in {folder} were rendered with another value of {what} "
                 f"({_shown(before.get(name))}, now {_shown(now[name])}); give the same, or another folder with -o"
             )
-        if changed:
-            for path in paths:
-                path.unlink(missing_ok=True)
-            if any(path.suffix in PICTURES for path in folder.iterdir()):
-                now |= dict.fromkeys(changed, "various")
+        unknown = set(map(str, found)) if isinstance(found := before.get(UNKNOWN), list) else set()
+        if lying := sorted(path.name for path in paths if path.name in unknown and path.exists() and options.resume):
+            raise UsageError(
+                f"--resume: {folder / lying[0]} was there before kprender, so what it shows is not known; delete it, "
+                "or give another folder with -o"
+            )
+        stale = names if changed else names & unknown
     elif options.resume and any(path.exists() for path in paths):
         raise UsageError(
             f"--resume: {folder} holds pictures and no {RECORD}, so what they show is not known; delete them, or give "
             "another folder with -o"
         )
+    else:
+        changed, stale, unknown = [], names, _pictures(folder)
+    for name in stale:
+        (folder / name).unlink(missing_ok=True)
+    if changed and _pictures(folder):
+        now |= dict.fromkeys(changed, "various")
+    if unknown := unknown & _pictures(folder) - names:
+        now[UNKNOWN] = sorted(unknown)
     with atomic_write(record) as temporary:
         temporary.write_text(json.dumps(now, indent=1) + "\n")
+
+
+def _pictures(folder: Path) -> set[str]:
+    """Return the names of the pictures in a folder."""
+    return {path.name for path in folder.iterdir() if path.suffix.lower() in PICTURES}
 
 
 def described(options: argparse.Namespace) -> dict[str, Any]:
@@ -111,5 +131,7 @@ def _identity(value: Any) -> Any:
 
 
 def _shown(value: Any) -> str:
-    """Return a value as it is given on the command line: a size as 640x480."""
-    return "none" if value is None else re.sub(r"\((\d+), (\d+)\)", r"\1x\2", str(value))
+    """Return a value as it is given on the command line: a size as 640x480, a colour as #ffffff."""
+    if isinstance(value, list):
+        return "#" + "".join(f"{round(255 * part):02x}" for part in value)
+    return "not given" if value is None else re.sub(r"\((\d+), (\d+)\)", r"\1x\2", str(value))
