@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from kpc.format.common.errors import DatasetError, UsageError
-from kpc.format.scene.cameras import MAX_SIDE, View, load_views
+from kpc.format.scene.cameras import MAX_SIDE, Camera, View, load_views
 from kpc.player.app.camera_paths import CameraPath
+from kpc.player.viewpoints import fit_camera
 from kpc.tools.exchange.placement import Placement
 
 # The most cameras, and the most instants of a moving one, that are written or read.
@@ -92,28 +93,35 @@ def placed(tracks: Sequence[Track], placement: Placement) -> list[Track]:
     ]
 
 
-def size_for(where: str, aspect: float, stored: object, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Return the size of a camera's pictures: `size`, else the one that the file stores, else one of its shape.
+def size_for(where: str, aspect: float, stored: object, size: tuple[int, int] | None) -> tuple[int, int, float]:
+    """Return the size of a camera's pictures, for which the aspect holds that is returned, too.
+
+    It is the size that the file stores, else `size`, else one of the file's shape. `fitted` makes it `size`.
 
     Args:
         where: the camera, which begins messages.
-        aspect: width over height of the pictures, with square pixels.
+        aspect: of the file: width over height of the pictures, with square pixels.
         stored: what the file holds as the size, a list of two integers; anything else counts as none.
         size: the one asked for.
 
     Raises:
         DatasetError: the aspect is none of pictures.
     """
-    if size is not None:
-        return size
     if isinstance(stored, list) and len(stored) == 2 and all(_is_side(side) for side in stored):
-        return int(stored[0]), int(stored[1])
+        return int(stored[0]), int(stored[1]), aspect
+    if size is not None:
+        return *size, size[0] / size[1]
     if not 1e-3 <= aspect <= 1e3:
         raise DatasetError(f"{where}: an aspect ratio of {aspect:g} is that of no picture; correct the camera")
     height = round(DEFAULT_WIDTH / aspect)
     if height > MAX_SIDE or height < 1:
         raise DatasetError(f"{where}: an aspect ratio of {aspect:g} needs --size")
-    return DEFAULT_WIDTH, height
+    return DEFAULT_WIDTH, height, aspect
+
+
+def fitted(camera: Camera, size: tuple[int, int] | None) -> Camera:
+    """Return a camera for pictures of the size asked for, with the same vertical field of view and shape of pixels."""
+    return camera if size is None else fit_camera(camera, *size)
 
 
 def _is_side(side: object) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 from kpc.format.scene.camera_checks import check_lens, check_pose, number_of
 from kpc.format.scene.cameras import Camera, View
 from kpc.format.scene.rotations import quaternion_of, rotation_of
-from kpc.tools.exchange.camera_tracks import MAX_VIEWS, Track, size_for
+from kpc.tools.exchange.camera_tracks import MAX_VIEWS, Track, fitted, size_for
 from kpc.tools.exchange.gltf import GltfReader, GltfWriter
 
 NEAR = 0.01
@@ -175,7 +175,7 @@ def _track(
     if not 1e-6 < yfov < math.pi:
         raise reader.error(f"camera {name[:40]!r} has a field of view of {yfov:g} radians")
     aspect = number_of(where, lens, "aspectRatio", 16 / 9)
-    width, height = size_for(where, aspect, stored.get("size"), size)
+    width, height, aspect = size_for(where, aspect, stored.get("size"), size)
     fl_y = height / 2 / math.tan(yfov / 2)
     fl_x = width / (aspect * height / fl_y) if aspect > 0 else 0.0
     cx, cy = _centre(stored, width, height)
@@ -198,7 +198,7 @@ def _track(
         rigid = pose / np.append(np.where(axes > 0, axes, 1.0), 1.0)
         made = Camera(width, height, fl_x, fl_y, cx, cy, check_pose(where, rigid))
         file, at_s = (f"{k:04d}.png", float(instants[k])) if animated else (f"{name}.png", None)
-        views.append(View(made, float(time), file, at_s))
+        views.append(View(fitted(made, size), float(time), file, at_s))
     return Track(name, tuple(views))
 
 

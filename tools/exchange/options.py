@@ -108,7 +108,7 @@ def _add_geometry(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--size", type=size, metavar="WxH",
         help="points: size of the pictures of each of the scene's cameras that they are taken from; cameras that are "
-        "read: size of their pictures",
+        "read: size of their pictures; the vertical field of view stays the same",
     )  # fmt: skip
     group.add_argument("--backend", choices=("gl", "reference"), default="gl", help="points: as of kprender")
     group.add_argument(

@@ -20,7 +20,7 @@ from kpc.format.common.errors import DatasetError, MediaError
 from kpc.format.common.text import check_unicode
 from kpc.format.scene.camera_checks import check_lens, check_pose
 from kpc.format.scene.cameras import Camera, View
-from kpc.tools.exchange.camera_tracks import MAX_VIEWS, Track, size_for
+from kpc.tools.exchange.camera_tracks import MAX_VIEWS, Track, fitted, size_for
 from kpc.tools.exchange.gltf import MAX_FILE_BYTES
 
 FILM_WIDTH_MM = 36.0
@@ -166,7 +166,8 @@ def _track(
         )
         if not (focal > 0 and film_width > 0 and film_height > 0):
             raise DatasetError(f"{where}: focal length and apertures must be positive; correct the camera")
-        width, height = size_for(where, film_width / film_height, stored_size, size)
+        width, height, aspect = size_for(where, film_width / film_height, stored_size, size)
+        film_width = film_height * aspect
         fl_x, fl_y = focal / film_width * width, focal / film_height * height
         cx, cy = (0.5 - shift_x / film_width) * width, (0.5 + shift_y / film_height) * height
         check_lens(where, (width, height), (fl_x, fl_y, cx, cy))
@@ -175,7 +176,7 @@ def _track(
             raise DatasetError(f"{where}: kpc:time {at:g} lies outside [0, 1]; correct the file")
         file, at_s = (f"{number:04d}.png", codes[number] / rate) if codes else (f"{name}.png", None)
         made = Camera(width, height, fl_x, fl_y, cx, cy, check_pose(where, _pose(where, stage, camera, code)))
-        views.append(View(made, at, file, at_s))
+        views.append(View(fitted(made, size), at, file, at_s))
     return Track(name, tuple(views))
 
 
