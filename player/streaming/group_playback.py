@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from kpc.format.common.errors import KpcError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.groups import Groups
+from kpc.format.container.scene_io import SceneReader
 from kpc.format.container.sources import RemoteSource, Source
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
@@ -69,8 +70,8 @@ class GroupPlayback:
         self.source, self.memory, self._arrived = source, memory, arrived
         self.groups = Groups(source, memory_budget=memory, allow_partial=True, in_parts=True)
         self.timeline, self.clip = self.groups.timeline, self.groups.clip
-        self._group_memory = memory if self.groups.is_single else memory // 2
-        self._shown = LoadedGroup(0, Stream(self.groups.open(0), memory=self._group_memory, arrived=arrived))
+        self._share = 1.0 if self.groups.is_single else 0.5
+        self._shown = LoadedGroup(0, self._stream(self.groups.open(0), arrived))
         self.cameras, self.metadata = self._shown.stream.scene.cameras, self.groups.metadata()
         self._describe(self._shown.stream)
         self._next: LoadedGroup | None = None
@@ -344,9 +345,13 @@ class GroupPlayback:
                 self._release(self._next)
             self._next, self._opened, self._opening = opened, None, None
 
+    def _stream(self, group: SceneReader, arrived: Callable[[], None]) -> Stream:
+        """Return a group as it arrives, which may take its share of the memory."""
+        return Stream(group, memory=int(self.memory * self._share), arrived=arrived, share=self._share)
+
     def _open_in_thread(self, number: int) -> None:
         try:
-            stream = Stream(self.groups.open(number, apart=True), memory=self._group_memory, arrived=self._wake)
+            stream = self._stream(self.groups.open(number, apart=True), self._wake)
             self._describe(stream)
             self._opened = LoadedGroup(number, stream)
             if self._closed:

@@ -8,6 +8,7 @@ and are dropped when the playhead has passed them and the memory is needed; spac
 only. Local files are read in the same way as those of a server.
 """
 
+import math
 import threading
 import time as clock
 from collections import deque
@@ -69,6 +70,7 @@ class Stream:
         memory: bytes that the scene may take in main memory and on the graphics card together. Pictures, shaders and
             the program itself do not count.
         arrived: called by the fetching thread when a segment has arrived; may wake the window.
+        share: what part of --memory this scene may take, for messages.
 
     Attributes:
         memory: as given.
@@ -81,7 +83,12 @@ class Stream:
     """
 
     def __init__(
-        self, source: Source | Reader, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None
+        self,
+        source: Source | Reader,
+        *,
+        memory: int = DEFAULT_BUDGET,
+        arrived: Callable[[], None] = lambda: None,
+        share: float = 1.0,
     ) -> None:
         self._reader = SceneReader(source, memory_budget=memory, in_parts=True)
         self.source: Source = self._reader.source
@@ -91,8 +98,10 @@ class Stream:
         self._layout = Layout.of(self.scene)
         fixed, least = self.fixed_bytes, min_segment_bytes(self.parts)
         if fixed + least > memory:
+            needed = math.ceil((fixed + least) / share / 1e6)
             raise BudgetError(
-                f"{self.source.name}: playing takes {fixed + least:,} bytes, more than --memory {memory:,}"
+                f"{self.source.name}: playing takes more than --memory {memory / share / 1e6:.4g}MB; give "
+                f"--memory {needed}MB"
             )
         self._segment_memory = memory - fixed
         self._stored = np.array([self.parts.entry(number).stored_length for number in self.parts.numbers])

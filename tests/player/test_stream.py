@@ -161,8 +161,13 @@ def test_a_long_clip_plays_in_little_memory(watched: Callable[..., Stream], tmp_
 
 def test_too_little_memory_is_reported_before_a_plane_is_fetched() -> None:
     data = long_scene()
-    with pytest.raises(BudgetError, match=r"playing takes [\d,]+ bytes, more than --memory 3,000,000"):
+    with pytest.raises(BudgetError, match=r"playing takes more than --memory 3MB; give --memory \d+MB") as refusal:
         Stream(open_source(data), memory=3_000_000)
+    needed = int(str(refusal.value).rsplit(" ", 1)[1].removesuffix("MB")) * 1_000_000
+    Stream(open_source(data), memory=needed).close()
+    with pytest.raises(BudgetError, match="than --memory 6MB; give --memory") as refusal:  # of two groups, one
+        Stream(open_source(data), memory=3_000_000, share=0.5)
+    assert 2 * needed - 10**6 <= int(str(refusal.value).rsplit(" ", 1)[1].removesuffix("MB")) * 10**6 <= 2 * needed
     assert "fetching" not in [thread.name for thread in threading.enumerate()]
 
 
