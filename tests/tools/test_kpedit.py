@@ -65,13 +65,18 @@ def test_texts_are_set_and_removed_and_all_chunks_are_copied(folder, name, capsy
     assert groups.Groups(again).metadata().document == expected and stored(again) == stored(folder / name)
 
 
-def test_provenance_comes_from_a_file_and_goes(folder):
+def test_provenance_comes_from_a_file_and_goes(folder, capsys):
     (folder / "made.json").write_text(json.dumps({"preset": "fast", "seed": 3}))
     out = edit(folder, "--provenance", str(folder / "made.json"), "--transparent")
     assert read(out).metadata.document == {"provenance": {"preset": "fast", "seed": 3}, "transparent": True}
     again = folder / "again.kpc"
+    assert kpedit.main([str(out), "-o", str(again), "--provenance", str(folder / "made.json")]) == 2
+    assert "holds its own (preset, seed)" in capsys.readouterr().err
     assert kpedit.main([str(out), "-o", str(again), "--no-provenance", "--no-transparent"]) == 0
     assert not read(again).metadata and again.read_bytes() == (folder / "scene.kpc").read_bytes()
+    scaled = edit(folder, "--scale", "2").rename(folder / "scaled.kpc")
+    assert kpedit.main([str(scaled), "-o", str(again), "--provenance", str(folder / "made.json")]) == 0
+    assert set(read(again).metadata.provenance) == {"history", "preset", "seed"}
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ import numpy as np
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
-from kpc.format.common.text import counted, escaped, notice
+from kpc.format.common.text import counted, escaped, first_names, notice
 from kpc.format.common.version import VERSION
 from kpc.format.container.clip_sound import has_sound
 from kpc.format.container.groups import Groups, load
@@ -210,11 +210,11 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement:
         metadata = metadata.with_members(opening={"camera": camera_document(view.camera), "time": view.time})
     if options.start is not None or options.end is not None or options.box is not None:
         metadata = metadata.with_provenance(held_out=None)  # it was measured on the whole
+    if options.provenance is not None:
+        metadata = metadata.with_provenance(**_provenance_for(metadata, options))
     if step := _history(options):
         history = [*metadata.provenance.get("history", []), *step]
         metadata = metadata.with_provenance(history=history[-HISTORY_LIMIT:])
-    if options.provenance is not None:
-        metadata = metadata.with_provenance(**_json_object(options.provenance))
     if options.no_provenance:
         return metadata.with_members(provenance=None)
     return metadata
@@ -274,6 +274,22 @@ def _found_view(metadata: Metadata, path: Path) -> Mapping[str, Any]:
 
     found = view_members(scene, *find_view(scene, look))
     return {name: value for name, value in found.items() if name != "up" or "up" not in metadata.document}
+
+
+def _provenance_for(metadata: Metadata, options: argparse.Namespace) -> dict[str, Any]:
+    """Return the members that --provenance names, for a scene that holds no more than a history.
+
+    Raises:
+        UsageError: the scene holds its own, or it is no JSON object.
+    """
+    given = _json_object(options.provenance)
+    own = [name for name in metadata.provenance if name != "history" or name in given]
+    if own:
+        raise UsageError(
+            f"--provenance: {options.scene} holds its own ({first_names(own)}); leave the option out, or take away "
+            "what the file holds by kpedit --no-provenance first"
+        )
+    return given
 
 
 def _json_object(path: Path) -> dict[str, Any]:
