@@ -418,6 +418,12 @@ def test_a_worker_that_is_killed_is_replaced_and_its_task_goes_on(tmp_path: Path
     assert 30 <= len(steps) <= 32  # at most the step of each task that the killed worker was in is done twice
 
 
+def in_steps_without_ctrl_c(task: Task, place: Place, report: Report) -> Outcome:
+    """Do ten steps in a process that Ctrl-C does not reach."""
+    assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    return in_steps(task, place, report)
+
+
 class Killer(Engine):
     """Kills the worker of the first task that is done before its outcome is asked for."""
 
@@ -434,8 +440,9 @@ class Killer(Engine):
 
 
 def test_an_outcome_that_is_lost_with_its_worker_is_waited_for_again(tmp_path: Path) -> None:
+    """Neither the first worker nor the one that replaces it gets the Ctrl-C of a terminal, by which kpbatch ends."""
     with engine.local_cluster(1, Resources()) as client:
-        made = Killer(lambda: client, Place(str(tmp_path)), in_steps)
+        made = Killer(lambda: client, Place(str(tmp_path)), in_steps_without_ctrl_c)
         made.add([task(0)])
         assert [event.kind for event in made.events() if event.kind != "runs"] == ["waits", "done"]
     assert len(list(tmp_path.glob("key?.*"))) == 10
@@ -545,6 +552,17 @@ def test_changed_files_of_a_work_folder_reach_the_store(tmp_path: Path) -> None:
     (work / "group-0000/checkpoint.kpck").write_bytes(b"22")
     uploads.run()
     assert store.exists(f"key/{WORK}/group-0000/checkpoint.kpck")
+
+
+def test_progress_is_what_the_log_says_of_it(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    log.write_text(
+        "training: 40 %, 12 s left, step 1,200, 27.5 dB, 30 rays/s\n"
+        "channels kept: 8 of 8, a loss of 0.001 dB, 0.1 allowed\n"
+    )
+    assert working._progress(log) == {"percent": 40, "left_s": 12, "psnr": 27.5}
+    log.write_text("channels kept: 8 of 8, a loss of 0.001 dB, 0.1 allowed\n")
+    assert working._progress(log) == {}
 
 
 def test_failures_are_listed_and_what_is_done_is_published(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,11 +3,13 @@
 import contextlib
 import logging
 import os
+import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from functools import cached_property
+from multiprocessing import resource_tracker
 from typing import Any
 
 import dask
@@ -67,23 +69,39 @@ def local_workers(resources: Resources) -> int:
 def local_cluster(workers: int, resources: Resources) -> Iterator[Client]:
     """Yield the client of a cluster on this machine, whose workers hold one task each."""
     held = {"cores": resources.cores, "gpus": resources.gpus}
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": KILLED_WORKERS}),
-        LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            memory_limit=None,
-            resources=held,
-            dashboard_address=":0",  # any port that is free
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        try:
-            yield client
-        except KeyboardInterrupt:
-            interrupts.heard()  # ending workers takes some seconds
-            raise
+    with dask.config.set({"distributed.scheduler.allowed-failures": KILLED_WORKERS}):
+        with _without_ctrl_c():
+            made = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                memory_limit=None,
+                resources=held,
+                dashboard_address=":0",  # any port that is free
+                silence_logs=logging.CRITICAL,
+            )
+        with made as cluster, Client(cluster) as client:
+            try:
+                yield client
+            except KeyboardInterrupt:
+                interrupts.heard()  # ending workers takes some seconds
+                raise
+
+
+@contextlib.contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Keep Ctrl-C from the threads that are started meanwhile, and from the processes that these start at any time.
+
+    A terminal sends it to all processes: workers would print tracebacks, though they end with this process.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # which would permit SIGINT again to the thread that starts it
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager

@@ -31,6 +31,9 @@ LOCAL_FILES = ("pixels-*", ".*", "*.lock")
 MEANS = ("test_psnr", "test_psnr_moving", "test_psnr_still", "test_ssim")
 SUMS = ("test_pictures", "steps", "train_s", "coding_s", "encode_s")
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+# What a line of progress of kpenc says, and the PSNR of its lines about training and held-out views.
+PROGRESS = {"percent": r": (\d+) %", "left_s": r"(\d+) s left"}
+PSNR = re.compile(r"(?:\bstep [\d,]+, |held-out PSNR )([\d.]+) dB")
 
 # Takes the progress of a task that runs: percent done, seconds left, and PSNR, as far as they are known.
 Report = Callable[[dict[str, float]], None]
@@ -166,9 +169,12 @@ class Uploads:
 
 
 def _progress(log: Path) -> dict[str, float]:
-    """Return what the last line of a log says of progress: percent, seconds left, PSNR."""
-    lines = log.read_text(errors="replace").splitlines()
-    line = next((line for line in reversed(lines) if " %" in line or " dB" in line), "")
-    patterns = {"percent": r": (\d+) %", "left_s": r"(\d+) s left", "psnr": r"([\d.]+) dB"}
-    found = {name: re.search(pattern, line) for name, pattern in patterns.items()}
+    """Return what a log says of progress: percent and seconds left, by its last line about either, and the last PSNR.
+
+    Losses, gains and noise floors have the unit of the PSNR, too.
+    """
+    lines = log.read_text(errors="replace").splitlines()[::-1]
+    line = next((line for line in lines if " %" in line), "")
+    found = {name: re.search(pattern, line) for name, pattern in PROGRESS.items()}
+    found["psnr"] = next((match for match in map(PSNR.search, lines) if match), None)
     return {name: float(match[1]) for name, match in found.items() if match}
