@@ -236,6 +236,24 @@ def test_files_that_cannot_be_coded_are_refused_before_anything_starts(
     assert main([names[2], "-o", str(tmp_path / "out"), "--dry-run"]) == 0 and not (tmp_path / "out").exists()
 
 
+def test_a_plan_as_json_is_a_line_for_each_job_and_a_sum(
+    tmp_path: Path, take: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In a folder that -o names, which the file of jobs need not do."""
+    file = write(tmp_path, '[[scene]]\nsource = "take"\n')
+    assert main([str(file), "-o", str(tmp_path / "out"), "--json", "--dry-run"]) == 0
+    first, last = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (first["job"], first["state"], first["source"]) == ("take", "waits", str(take))
+    assert last == {"jobs": 1, "done": 0}
+    assert jobs.read_jobs(file, "s3://place").output == "s3://place"
+
+
+def test_folders_of_one_name_are_refused_with_a_remedy_of_the_command_line(tmp_path: Path, take: Path) -> None:
+    shutil.copytree(take, tmp_path / "other" / "take")
+    with pytest.raises(FaultyBatch, match=r"other/take: the name 'take' is taken by .*; name them in a file of jobs"):
+        jobs.jobs_of_folders([str(take), str(tmp_path / "other" / "take")], [], Resources())
+
+
 def test_an_address_follows_content_options_and_group(take: Path) -> None:
     def keys(options: tuple[str, ...]) -> list[str]:
         source_address.cache_clear()

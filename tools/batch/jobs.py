@@ -104,8 +104,12 @@ class Faults:
             raise FaultyBatch(list(self.lines))
 
 
-def read_jobs(path: Path) -> Batch:
+def read_jobs(path: Path, place: str | None = None) -> Batch:
     """Read a batch from a TOML file.
+
+    Args:
+        path: of the file.
+        place: folder or address that the results go to in place of the file's own.
 
     Raises:
         UsageError: it cannot be read.
@@ -119,7 +123,7 @@ def read_jobs(path: Path) -> Batch:
     lines, faults = TomlLines(path, text), Faults()
     for key in document.keys() - TABLES - {"output", "scene"}:
         faults.add(lines.of(key), f"{key!r} is not known; known are output, scene, {', '.join(sorted(TABLES))}")
-    output = document.get("output")
+    output = document.get("output", place)
     if not isinstance(output, str) or not output:
         faults.add(lines.of("output"), 'output names the folder of the results; write for example output = "out"')
     scenes = document.get("scene", [])
@@ -134,9 +138,9 @@ def read_jobs(path: Path) -> Batch:
     jobs: list[Job] = []
     for number, scene in enumerate(scenes):
         jobs += _jobs_of(scene, number, common, path.parent, lines, faults)
-    _check_names(jobs, faults)
+    _check_names(jobs, "give the scene another name", faults)
     faults.check()
-    return Batch(tuple(jobs), resolve(str(output), path.parent))
+    return Batch(tuple(jobs), resolve(str(output), path.parent) if place is None else resolve(place, Path()))
 
 
 def jobs_of_folders(folders: Sequence[str], options: Sequence[str], resources: Resources) -> tuple[Job, ...]:
@@ -154,7 +158,7 @@ def jobs_of_folders(folders: Sequence[str], options: Sequence[str], resources: R
             continue
         job = Job(name_of(source), source, tuple(options), resources=resources, where=folder)
         jobs.append(_checked(job, faults))
-    _check_names(jobs, faults)
+    _check_names(jobs, "name them in a file of jobs, or give them to two commands with a folder -o each", faults)
     faults.check()
     return tuple(jobs)
 
@@ -299,9 +303,9 @@ def _checked(job: Job, faults: Faults) -> Job:
     return job
 
 
-def _check_names(jobs: Sequence[Job], faults: Faults) -> None:
+def _check_names(jobs: Sequence[Job], remedy: str, faults: Faults) -> None:
     first: dict[str, Job] = {}
     for job in jobs:
         other = first.setdefault(job.name, job)
         if other is not job:
-            faults.add(job.where, f"the name {job.name!r} is taken by {other.where}; give the scene another name")
+            faults.add(job.where, f"the name {job.name!r} is taken by {other.where}; {remedy}")

@@ -1,13 +1,14 @@
 """What a batch leaves: the results by name, a table, and report.html."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from urllib.parse import quote
 
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import escaped
 from kpc.tools.batch.jobs import Job
 from kpc.tools.batch.store import SCENE, Store
-from kpc.tools.batch.tasks import Outcome
+from kpc.tools.batch.tasks import Outcome, Task
 from kpc.tools.pages import render
 
 # The folder below the output that all workers share.
@@ -38,6 +39,19 @@ def publish(jobs: Sequence[Job], ended: Mapping[str, Outcome], store: Store, out
         output.copy(f"{SHARED}/{outcome.key}/{SCENE}", f"{job.name}.kpc")
         output.put_json({"key": outcome.key, "source": job.source, "options": job.options} | outcome.figures, name)
     return failed
+
+
+def print_plan(tasks: Sequence[Task], known: Collection[str], as_json: bool) -> None:
+    """Print a line for each first task of a job, whether its key is known as done, on stdout; as JSON, also a sum."""
+    for task in tasks:
+        is_done = task.key in known
+        if as_json:
+            found = {"task": task.name, "job": task.job, "key": task.key, "state": "done" if is_done else "waits"}
+            print(json.dumps(found | {"source": task.source}))
+        else:
+            print(escaped(f"{task.key} {'done' if is_done else 'to do':<5} {task.name}: {task.source}"))
+    if as_json:
+        print(json.dumps({"jobs": len(tasks), "done": sum(task.key in known for task in tasks)}))
 
 
 def print_summary(jobs: Sequence[Job], ended: Mapping[str, Outcome], as_json: bool) -> None:

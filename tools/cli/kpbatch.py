@@ -16,7 +16,7 @@ from pathlib import Path
 
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
-from kpc.format.common.text import counted, escaped, notice
+from kpc.format.common.text import counted, notice
 from kpc.tools.batch.jobs import (
     ADDRESS,
     Batch,
@@ -29,7 +29,7 @@ from kpc.tools.batch.jobs import (
     resolve,
 )
 from kpc.tools.batch.store import Store
-from kpc.tools.batch.summary import SHARED, check_report, print_summary, publish, write_report
+from kpc.tools.batch.summary import SHARED, check_report, print_plan, print_summary, publish, write_report
 from kpc.tools.batch.tasks import PREPARE, Outcome, done_before, first_tasks, is_last, tasks_of_groups
 
 
@@ -60,8 +60,7 @@ def _command(argv: list[str]) -> None:
     check_report(output)
     first, known = first_tasks(batch.jobs), done_before(store)
     if options.dry_run:
-        for task in first:
-            print(escaped(f"{task.key} {'done' if task.key in known else 'to do':<5} {task.name}: {task.source}"))
+        print_plan(first, known, options.json)
         return
     ended = _run(batch.jobs, shared, known, options)
     failed = publish(batch.jobs, ended, store, output)
@@ -123,8 +122,7 @@ def _batch(options: argparse.Namespace, words: Sequence[str]) -> Batch:
     if first.suffix == ".toml":
         if len(options.sources) > 1 or words:
             raise UsageError(f"{first}: names scenes and options itself; drop what else is given")
-        batch = read_jobs(first)
-        return batch if options.output is None else Batch(batch.jobs, resolve(options.output, Path()))
+        return read_jobs(first, options.output)
     if options.output is None:
         raise UsageError("-o names the folder of the results; give for example -o out/")
     jobs = jobs_of_folders(options.sources, words, Resources(options.cores, options.memory or 0))
