@@ -11,6 +11,7 @@ import pytest
 from kpc import commands
 from kpc.format.common.text import byte_text
 from kpc.tools.bench import kpbench
+from kpc.tools.cli import kpedit
 
 COMMANDS = [one.args[1] for one in vars(commands).values() if isinstance(one, functools.partial)]
 PARTS = [[], *([name] for name in kpbench.APART)]
@@ -49,6 +50,26 @@ def test_no_message_names_a_function(module: str, monkeypatch: pytest.MonkeyPatc
                 except argparse.ArgumentTypeError as error:  # of another error argparse prints the function's name
                     refused += "invalid" not in str(error)
     assert refused or module.endswith("kpjoin")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["a.kpc", "--from", "-1s"], "argument --from: '-1s' begins with a dash; write --from=-1s"),
+        (["a.kpc", "--fro", "-1s", "-o", "b"], "argument --from: '-1s' begins with a dash; write --fro=-1s"),
+        (["-o", "-x.kpc"], "argument -o/--output: '-x.kpc' begins with a dash; write -o=-x.kpc"),
+        (["a.kpc", "-o"], "argument -o/--output: expected one argument"),
+        (["a.kpc", "--from", "--to", "2s"], "argument --from: expected one argument"),
+        (["a.kpc", "--from", "--to=2s"], "argument --from: expected one argument"),
+        (["a.kpc", "--from=-1s", "-o", "b.kpc"], "argument --from: '-1s' is not a duration"),
+    ],
+)
+def test_a_value_that_begins_with_a_dash_is_named_with_its_remedy(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        kpedit.main(words)
+    assert f"kpedit: error: {said}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import errno
 import io
+import itertools
 import json
 import math
 import os
@@ -11,7 +12,7 @@ import re
 import stat
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -91,9 +92,37 @@ def message_of(error: KpcError | OSError) -> str | None:
 class Parser(argparse.ArgumentParser):
     """A parser of a command's options whose errors are one line; names in them may hold line breaks."""
 
+    _words: Sequence[str] = ()
+
+    def parse_known_args(  # type: ignore[override]  # overloads of one meaning
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> tuple[Any, list[str]]:
+        """Parse words as argparse does, and remember them for `error`."""
+        self._words = sys.argv[1:] if args is None else list(args)
+        return super().parse_known_args(args, namespace)
+
     def error(self, message: str) -> NoReturn:
-        """Print the usage and the error, and exit with 2."""
+        """Print the usage and the error, and exit with 2.
+
+        A value that begins with a dash, which argparse takes for an option and therefore misses, is named.
+        """
+        if missed := re.fullmatch(r"argument (\S+): expected one argument", message):
+            for option, value in itertools.pairwise(self._words):
+                if self._are_option_and_value(missed[1].split("/"), option, value):
+                    message = f"argument {missed[1]}: {value!r} begins with a dash; write {option}={value}"
         super().error(escaped(message))
+
+    def _are_option_and_value(self, names: Sequence[str], option: str, value: str) -> bool:
+        """Return whether a word is an option of one of these names, and the next one its value, beginning with a dash.
+
+        Long names may be abbreviated.
+        """
+
+        def means(word: str, names: Iterable[str]) -> bool:
+            return word in names or (word.startswith("--") and any(name.startswith(word) for name in names))
+
+        known = self._option_string_actions
+        return means(option, names) and len(value) > 1 and value[0] == "-" and not means(value.split("=")[0], known)
 
 
 def add_version_option(parser: argparse.ArgumentParser) -> None:
