@@ -4,21 +4,29 @@ import argparse
 import datetime
 import math
 import os
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from kpc.format.common.errors import FormatError, UsageError
 from kpc.format.container.metadata_chunk import pack_metadata
+from kpc.format.container.scene_layout import BOX_LIMIT
 from kpc.format.scene.metadata import Metadata
 
 TEXTS = {
     "title": "of the scene",
-    "description": "of the scene; lines may be separated by \\n",
+    "description": "of the scene; \\n begins another line, and \\\\ is a backslash",
     "author": "of the recording",
     "licence": "under which it may be used, for example CC-BY-4.0",
     "date": "of the recording: 2026, 2026-11 or 2026-11-27",
 }
-LIMITS = ("azimuth", "elevation", "distance", "reach")
+# Members of `view_limits` that may be given: their least and largest value, and what to write.
+LIMITS = {
+    "azimuth": (-360.0, 360.0, "degrees from -360 to 360, at most a full turn"),
+    "elevation": (-90.0, 90.0, "degrees from -90 to 90"),
+    "distance": (math.ulp(0.0), float(BOX_LIMIT), f"lengths above 0, up to {BOX_LIMIT:.3g}"),
+    "reach": (0.0, float(BOX_LIMIT), f"a length from 0 to {BOX_LIMIT:.3g}"),
+}
 
 
 def add_metadata_options(parser: argparse.ArgumentParser) -> None:
@@ -61,13 +69,11 @@ def view_limits(text: str) -> str | dict[str, Any]:
             raise argparse.ArgumentTypeError(f"{part!r}: write finite numbers, such as azimuth=-30:30")
         if numbers[0] > numbers[-1]:
             raise argparse.ArgumentTypeError(f"{part!r}: the least value is above the largest; swap them")
+        least, most, what = LIMITS[name]
+        is_beyond = numbers[0] < least or numbers[-1] > most
+        if is_beyond or (name == "azimuth" and numbers[1] - numbers[0] > 360):
+            raise argparse.ArgumentTypeError(f"{part!r}: write {what}")
         found[name] = numbers[0] if name == "reach" else numbers
-    placeholder = {"focus": [0, 0, 0], "forward": [1, 0, 0], "azimuth": [0, 0], "elevation": [0, 0]}
-    limits = {**placeholder, "distance": [1, 1], "reach": 0, **found}
-    try:
-        pack_metadata(Metadata({"up": [0, 0, 1], "view_limits": limits}))
-    except FormatError as error:
-        raise argparse.ArgumentTypeError(str(error).removeprefix("meta: ")) from error
     return found
 
 
@@ -89,13 +95,16 @@ def _text(name: str) -> Any:
     def parse(text: str) -> str:
         # Arguments are decoded as the locale says, which may be no more than ASCII; terminals send UTF-8.
         text = os.fsencode(text).decode("utf-8", "replace")
-        text = text.replace("\\n", "\n") if name == "description" else text
+        if name == "description":
+            text = re.sub(r"\\[\\n]", lambda escape: "\n" if escape[0] == "\\n" else "\\", text)
+        text = "" if text.isspace() else text
         if name == "date" and text:
             _check_date(text)
         try:
             pack_metadata(Metadata({name: text} if text else {}))
         except FormatError as error:
-            raise argparse.ArgumentTypeError(str(error).removeprefix("meta: ")) from error
+            reason = str(error).removeprefix("meta: ").removeprefix(f"meta.{name}: ")
+            raise argparse.ArgumentTypeError(reason) from error
         return text
 
     parse.__name__ = name

@@ -4,6 +4,7 @@ All of it is optional. A file holds it as a JSON object (spec/kpc-format.md, "me
 checked by `kpc.format.container.metadata_chunk`; members that this version does not know are kept.
 """
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -50,6 +51,22 @@ class ViewLimits:
     elevation: tuple[float, float]
     distance: tuple[float, float]
     reach: float
+
+    def position(self, eye: np.ndarray) -> tuple[float, float, float]:
+        """Return the azimuth, nearest to the middle of its limits, the elevation and the distance of a point.
+
+        Args:
+            eye: (3,) the point, world coordinates.
+
+        Returns:
+            Radians, radians and world units.
+        """
+        offset = eye - self.focus
+        distance = max(float(np.linalg.norm(offset)), 1e-12)
+        azimuth = math.atan2(float(offset @ np.cross(self.up, self.forward)), float(offset @ self.forward))
+        middle = sum(self.azimuth) / 2
+        azimuth = middle + math.remainder(azimuth - middle, 2 * math.pi)
+        return azimuth, math.asin(min(max(float(offset @ self.up) / distance, -1.0), 1.0)), distance
 
 
 @dataclass(frozen=True)

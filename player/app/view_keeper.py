@@ -29,7 +29,7 @@ def kept(view: OrbitView, limits: ViewLimits, seconds: float) -> OrbitView:
     offset = view.focus - limits.focus
     away = float(np.linalg.norm(offset))
     target_beyond = max(away - limits.reach, 0.0)
-    position = np.array(_position(view.eye, limits))
+    position = np.array(limits.position(view.eye))
     excess = position - _nearest(position, limits)
     scale = np.array([1.0, 1.0, limits.distance[1]])
     if target_beyond <= NEARLY * limits.distance[1] and (np.abs(excess) <= NEARLY * scale).all():
@@ -40,16 +40,6 @@ def kept(view: OrbitView, limits: ViewLimits, seconds: float) -> OrbitView:
     eye = _eye(position - share * excess, limits)
     axes = look_at(eye, focus, limits.up)[:3, :3]
     return OrbitView(view.lens, focus, float(np.linalg.norm(eye - focus)), axes, view.up)
-
-
-def _position(eye: np.ndarray, limits: ViewLimits) -> tuple[float, float, float]:
-    """Return the azimuth, nearest to the middle of its limits, the elevation and the distance of a point."""
-    offset = eye - limits.focus
-    distance = max(float(np.linalg.norm(offset)), 1e-12)
-    azimuth = math.atan2(float(offset @ np.cross(limits.up, limits.forward)), float(offset @ limits.forward))
-    middle = sum(limits.azimuth) / 2
-    azimuth = middle + math.remainder(azimuth - middle, 2 * math.pi)
-    return azimuth, math.asin(min(max(float(offset @ limits.up) / distance, -1.0), 1.0)), distance
 
 
 def _nearest(position: np.ndarray, limits: ViewLimits) -> np.ndarray:

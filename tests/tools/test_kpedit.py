@@ -54,14 +54,15 @@ def stored(path: Path) -> list[tuple[str, bytes]]:
 
 @pytest.mark.parametrize("name", ["scene.kpc", "clip.kpc"])
 def test_texts_are_set_and_removed_and_all_chunks_are_copied(folder, name, capsys):
-    out = edit(folder, "--title", "Tänzer", "--description", "a\\nb", "--date", "2026-11", scene=name)
-    expected = {"title": "Tänzer", "description": "a\nb", "date": "2026-11"}
+    texts = ["--title", "Tänzer", "--description", r"a\\n\nb", "--date", "2026-11", "--author", " "]
+    out = edit(folder, *texts, scene=name)
+    expected = {"title": "Tänzer", "description": "a\\n\nb", "date": "2026-11"}
     assert groups.Groups(out).metadata().document == expected and stored(out) == stored(folder / name)
     assert kpinfo.main([str(out)]) == 0
-    assert "title       Tänzer\n  description a\n              b\n" in capsys.readouterr().out
+    assert "title       Tänzer\n  description a\\n\n              b\n" in capsys.readouterr().out
     again = folder / "again.kpc"
     assert kpedit.main([str(out), "-o", str(again), "--title", "", "--up", "0,0,2", "--metres-per-unit", "0.5"]) == 0
-    expected = {"description": "a\nb", "date": "2026-11", "up": [0, 0, 2], "metres_per_unit": 0.5}
+    expected = {"description": "a\\n\nb", "date": "2026-11", "up": [0, 0, 2], "metres_per_unit": 0.5}
     assert groups.Groups(again).metadata().document == expected and stored(again) == stored(folder / name)
 
 
@@ -96,7 +97,7 @@ def test_contradictions_and_what_no_file_holds_are_refused(folder, capsys, words
     assert code == 2 and message in capsys.readouterr().err and not (folder / "refused.kpc").exists()
 
 
-def test_view_limits_are_found_and_set_and_taken_away(folder):
+def test_view_limits_are_found_and_set_and_taken_away(folder, capsys):
     found = read(edit(folder, "--view-limits", "auto")).metadata
     limits = found.view_limits
     assert limits.azimuth[0] <= 0 <= limits.azimuth[1] and limits.distance[0] < 3 <= limits.distance[1] * 1.001
@@ -107,6 +108,9 @@ def test_view_limits_are_found_and_set_and_taken_away(folder):
     (folder / "out.kpc").rename(folder / "limited.kpc")
     changed = read(edit(folder, "--view-limits", "azimuth=-3:4.5,reach=0", scene="limited.kpc")).metadata
     assert changed.document["view_limits"] == {**found.document["view_limits"], "azimuth": [-3, 4.5], "reach": 0}
+    assert "outside" not in capsys.readouterr().err
+    edit(folder, "--view-limits", "distance=5:6,elevation=-5:5", scene="limited.kpc")
+    assert "outside the limits of its elevation and distance" in capsys.readouterr().err
     none = read(edit(folder, "--view-limits", "none", scene="limited.kpc")).metadata
     assert none == found.with_members(view_limits=None)
 
@@ -154,12 +158,19 @@ def test_up_and_unit_hold_where_the_scene_is_put(folder):
 @pytest.mark.parametrize(
     "options, code, words",
     [
-        (["--title", "\x1b[2J"], 2, "control characters"),
+        (["--title", "\x1b[2J"], 2, "argument --title: a text holds tabs or other control characters"),
         (["--date", "yesterday"], 2, "is no date like 2026"),
         (["--date", "2026-13"], 2, "is no date like 2026"),
         (["--up", "0,0,0"], 2, "is not a direction"),
         (["--view-limits", "azimuth=3"], 2, "is not like azimuth=-30:30"),
         (["--view-limits", "azimuth=30:-30"], 2, "least value is above the largest"),
+        (["--view-limits", "azimuth=-300:300"], 2, "at most a full turn"),
+        (["--view-limits", "elevation=-100:100"], 2, "'elevation=-100:100': write degrees from -90 to 90"),
+        (["--view-limits", "distance=0:0"], 2, "'distance=0:0': write lengths above 0, up to 1.07e+09"),
+        (["--view-limits", "reach=-1"], 2, "write a length from 0"),
+        (["--turn", "x"], 2, "'x' is not a turn such as x:-90"),
+        (["--up", "x"], 2, "'x' is not three numbers from -1e9 to 1e9 such as 0,0,1"),
+        (["--move", "1,2"], 2, "such as 0,0,1"),
         (["--provenance", "broken.json"], 2, 'such as {"preset": "fast"}'),
         (["--provenance", "wrong.json"], 1, "seed is no integer"),
     ],

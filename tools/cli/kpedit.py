@@ -42,8 +42,8 @@ from kpc.tools.editing.clips import Edits, edit
 from kpc.tools.editing.placing import Placement, axis_turn
 from kpc.tools.editing.timing import MAX_FPS, MIN_FPS
 
-# Unit vectors that differ by no more than this are one direction: a file holds seven digits.
-SAME_DIRECTION = 1e-5
+# By this unit vectors of one direction, and numbers relative to their size, may differ: a file holds seven digits.
+ROUNDING = 1e-5
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -208,6 +208,8 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement:
     if options.open_at is not None:
         view = load_views(options.open_at)[0]
         metadata = metadata.with_members(opening={"camera": camera_document(view.camera), "time": view.time})
+    if options.open_at is not None or options.view_limits is not None:
+        _say_if_outside(metadata)
     if options.start is not None or options.end is not None or options.box is not None:
         metadata = metadata.with_provenance(held_out=None)  # it was measured on the whole
     if options.provenance is not None:
@@ -220,11 +222,30 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement:
     return metadata
 
 
+def _say_if_outside(metadata: Metadata) -> None:
+    """Say so if players will not stay at the opening view, since it lies outside the view limits."""
+    limits, opening = metadata.view_limits, metadata.opening
+    if limits is None or opening is None:
+        return
+    position = limits.position(opening.camera.camera_to_world[:3, 3])
+    bounds = {"azimuth": limits.azimuth, "elevation": limits.elevation, "distance": limits.distance}
+    outside = [
+        name
+        for number, (name, (low, high)) in zip(position, bounds.items(), strict=True)
+        if not low - ROUNDING * abs(low) <= number <= high + ROUNDING * abs(high)
+    ]
+    if outside:
+        notice(
+            f"kpedit: the opening view lies outside the limits of its {' and '.join(outside)}, and players move it "
+            "within; --open-at sets another"
+        )
+
+
 def _has_direction(up: np.ndarray | None, wanted: Sequence[float] | None) -> bool:
     """Return whether a unit vector `up` has the direction that is wanted; True where none is."""
     if up is None or wanted is None:
         return wanted is None
-    return bool(np.linalg.norm(up - np.array(wanted) / np.linalg.norm(wanted)) < SAME_DIRECTION)
+    return bool(np.linalg.norm(up - np.array(wanted) / np.linalg.norm(wanted)) < ROUNDING)
 
 
 def _with_limits(metadata: Metadata, options: argparse.Namespace, is_upright: bool) -> Metadata:
@@ -305,16 +326,17 @@ def _json_object(path: Path) -> dict[str, Any]:
     return document
 
 
-def _vector(text: str) -> tuple[float, ...]:
-    numbers = tuple(cli.number_within(number, -1e9, 1e9) for number in text.split(","))
-    if len(numbers) != 3:
-        raise argparse.ArgumentTypeError(f"{text!r} is not three numbers such as 0,0,1")
-    return numbers
+def _vector(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (cli.number_within(number, -1e9, 1e9) for number in text.split(","))
+    except (ValueError, argparse.ArgumentTypeError):
+        raise argparse.ArgumentTypeError(f"{text!r} is not three numbers from -1e9 to 1e9 such as 0,0,1") from None
+    return x, y, z
 
 
 def _turn(text: str) -> tuple[str, float]:
-    axis, _, degrees = text.partition(":")
-    if axis not in ("x", "y", "z"):
+    axis, colon, degrees = text.partition(":")
+    if axis not in ("x", "y", "z") or not colon:
         raise argparse.ArgumentTypeError(f"{text!r} is not a turn such as x:-90")
     return axis, cli.number_within(degrees, -360, 360)
 
