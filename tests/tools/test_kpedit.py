@@ -196,9 +196,11 @@ def test_the_input_is_not_overwritten_and_two_cameras_give_no_limits(folder, cap
 
 
 def test_what_changes_nothing_is_said_or_refused(folder, tmp_path, capsys):
-    copy = edit(folder)
-    assert "there is nothing to change" in capsys.readouterr().err
-    assert copy.read_bytes() == (folder / "scene.kpc").read_bytes()
+    turns = ["--turn", "x:90", "--turn", "x:-90", "--scale", "1", "--move", "0,0,0"]
+    for words in ([], ["--speed", "1", "--from", "0", "--to", "1.1"], ["--fps", "10", *turns]):
+        copy = edit(folder, *words)
+        assert "there is nothing to change" in capsys.readouterr().err
+        assert copy.read_bytes() == (folder / "scene.kpc").read_bytes()
     save(replace(tiny_scene(dynamic=False), cameras=()), tmp_path / "still.kpc")
     for option in ("--fps", "--speed"):
         assert kpedit.main([str(tmp_path / "still.kpc"), "-o", str(tmp_path / "out.kpc"), option, "2"]) in (1, 2)

@@ -36,6 +36,7 @@ from kpc.format.container.metadata_options import add_metadata_options, members_
 from kpc.format.container.rewriting import save, with_metadata
 from kpc.format.scene.cameras import Camera, load_views
 from kpc.format.scene.metadata import HISTORY_LIMIT, Metadata, camera_document
+from kpc.format.scene.scene import Clip
 from kpc.format.scene.view_limits import find_view, view_members
 from kpc.player.cpu import reference
 from kpc.tools.editing.clips import Edits, edit
@@ -55,7 +56,9 @@ def _command(argv: list[str]) -> None:
     options = _parser().parse_args(cli.join_values(argv, "--box", "--move", "--up"))
     cli.refuse_sources(options.output, options.scene)
     cli.check_writable(options.output)
-    edits, groups = _edits_from(options), Groups(options.scene)
+    groups = Groups(options.scene)
+    _drop_idle(options, groups.clip)
+    edits = _edits_from(options)
     if groups.clip.frame_count == 1 and (edits.speed is not None or edits.fps is not None):
         raise UsageError("--fps, --speed: the scene is static; it has no frames to show at another rate")
     if edits.speed is not None and has_sound(groups):
@@ -131,7 +134,10 @@ def _add_edits(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--move", type=_vector, metavar="X,Y,Z", help="move, after scaling and turning")
     parser.add_argument("--speed", type=_speed, metavar="F", help="play F times as fast: same frames, no sound")
     parser.add_argument(
-        "--fps", type=cli.frame_rate(MIN_FPS, MAX_FPS), metavar="F", help="frames per second, at the same length"
+        "--fps",
+        type=cli.frame_rate(MIN_FPS, MAX_FPS),
+        metavar="F",
+        help="frames per second, at the same speed; the last frame, too, then lasts 1 / F s",
     )
 
 
@@ -164,13 +170,35 @@ def _edits_from(options: argparse.Namespace) -> Edits:
         part_s = options.start or 0.0, math.inf if options.end is None else options.end
     placement = None
     if options.scale is not None or options.turn or options.move is not None:
-        turn = np.eye(3)
-        for axis, degrees in options.turn or ():
-            turn = axis_turn(axis, degrees) @ turn
-        placement = Placement(turn, options.scale or 1.0, np.array(options.move or (0.0, 0.0, 0.0)))
+        placement = Placement(_turn_of(options), options.scale or 1.0, np.array(options.move or (0.0, 0.0, 0.0)))
     box = None if options.box is None else np.reshape(options.box, (2, 3))
-    speed = None if options.speed == 1 else options.speed
-    return Edits(part_s, box, placement, speed, options.fps)
+    return Edits(part_s, box, placement, options.speed, options.fps)
+
+
+def _turn_of(options: argparse.Namespace) -> np.ndarray:
+    """Return the rotation of all --turn, one after the other, (3, 3)."""
+    turn = np.eye(3)
+    for axis, degrees in options.turn or ():
+        turn = axis_turn(axis, degrees) @ turn
+    return turn
+
+
+def _drop_idle(options: argparse.Namespace, clip: Clip) -> None:
+    """Set options that change nothing to None, so that they leave no figures out and no line in the history."""
+    if options.start == 0:
+        options.start = None
+    if options.end is not None and clip.duration_s <= options.end <= clip.total_s + cli.TIME_SLACK_S:
+        options.end = None
+    if options.scale == 1:
+        options.scale = None
+    if np.allclose(_turn_of(options), np.eye(3), rtol=0, atol=1e-12):
+        options.turn = None
+    if options.move is not None and not any(options.move):
+        options.move = None
+    if options.speed == 1:
+        options.speed = None
+    if options.fps == clip.fps and clip.frame_count > 1 and options.speed is None:
+        options.fps = None
 
 
 def _history(options: argparse.Namespace) -> list[str]:

@@ -28,7 +28,7 @@ class Edits:
         box: (2, 3) lower and upper corner of what to keep, world units before placing.
         placement: where to put it.
         speed: how many times as fast to play it.
-        fps: frames per second to have, after `speed`, at the same length.
+        fps: frames per second to have, after `speed`, with the first and the last frame at the same times.
     """
 
     part_s: tuple[float, float] | None = None
