@@ -318,7 +318,7 @@ class Reader:
 
     def _check_version(self, head: bytes) -> None:
         if head[: len(MAGIC)] != MAGIC[: len(head)] or not head:
-            raise FormatError(f"{self.name}: not a .kpc file")
+            raise FormatError(f"{self.name}: not a .kpc file" + ", since it is empty" * (not head))
         if len(head) >= VERSION_STRUCT.size:
             _, version, header_length = VERSION_STRUCT.unpack_from(head)
             if header_length == 0:  # in drafts a reserved field
@@ -340,7 +340,7 @@ class Reader:
                 f"{length} bytes"
             )
         if size > length:
-            raise FormatError(f"{self.name}: {size - length} bytes follow the end of the file")
+            raise FormatError(f"{self.name}: {size - length} bytes follow the end of the file; fetch the file again")
         if size < length and not allow_partial:
             raise FormatError(f"{self._cut_off(header)}; fetch the file again")
         if max(header.value_count, header.largest_raw) > length * EXPANSION_LIMIT:

@@ -69,7 +69,8 @@ class Address:
             host = shown if ":" in shown else _ascii_host(shown)
         except ValueError:  # its text may quote a password, as may the exceptions that it stands for
             encode = ", and write / ? # @ in a password as %2F %3F %23 %40" if "@" in text else ""
-            raise NetworkError(f"not a valid address; check its host and port{encode}") from None
+            shown = "" if "@" in text else printable(re.split("[?#]", text, maxsplit=1)[0]) + ": "
+            raise NetworkError(f"{shown}not a valid address; check its host and port{encode}") from None
         if parts.scheme not in SCHEMES:
             raise NetworkError(
                 f"{name}: no http or https address; other schemes cannot be read, so download it or give its path"

@@ -317,7 +317,11 @@ def test_a_path_is_no_address_without_its_scheme(path, tmp_path, monkeypatch, ca
 
 @pytest.mark.parametrize(
     "content, complaint",
-    [(b"", "not a .kpc file"), (b"RIFF" * 40, "not a .kpc file"), (b"\x89KPC\r\n\x1a\n", "cut off within the header")],
+    [
+        (b"", "not a .kpc file, since it is empty"),
+        (b"RIFF" * 40, "not a .kpc file"),
+        (b"\x89KPC\r\n\x1a\n", "cut off within the header"),
+    ],
 )
 def test_other_files(tmp_path, capsys, content, complaint):
     path = tmp_path / "other.kpc"
@@ -335,7 +339,7 @@ def test_a_missing_file_and_a_folder(tmp_path, capsys):
 
 def test_the_budget_is_an_option(scene_file, capsys):
     assert kpinfo.main([str(scene_file), "--memory", "1KB"]) == 1
-    assert "budget of 1,000" in capsys.readouterr().err
+    assert "budget of 1,000; give more with --memory" in capsys.readouterr().err
     assert kpinfo.main([str(scene_file), "--memory", "500MB"]) == 0
     with pytest.raises(SystemExit, match="2"):
         kpinfo.main([str(scene_file), "--memory", "0"])

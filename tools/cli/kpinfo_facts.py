@@ -10,7 +10,7 @@ import numpy as np
 
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common import cli
-from kpc.format.common.errors import FormatError, KpcError, UsageError
+from kpc.format.common.errors import BudgetError, FormatError, KpcError, UsageError
 from kpc.format.common.text import counted
 from kpc.format.container.clip_sound import SoundSpan, sound_spans
 from kpc.format.container.container import Codec, Entry
@@ -85,7 +85,7 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
         message = cli.message_of(error)
         if message is None:
             raise
-        info["error"] = message
+        info["error"] = f"{message}; give more with --memory" if isinstance(error, BudgetError) else message
     return info
 
 
