@@ -52,6 +52,17 @@ def stored(path: Path) -> list[tuple[str, bytes]]:
     return [(e.kind, reader.stored(n)) for n, e in enumerate(reader.index) if e.kind != "meta"]
 
 
+def test_the_progress_of_a_clip_is_one_of_all_groups(folder, monkeypatch, capsys):
+    for name in ("FIRST_LINE_S", "LINE_EVERY_S"):
+        monkeypatch.setattr(f"kpc.format.common.progress.{name}", 0.0)
+    edit(folder, "--speed", "2", scene="clip.kpc")
+    edited = [line.split(" ")[1] for line in capsys.readouterr().err.splitlines()]
+    assert set(edited) == {"0/2", "1/2", "2/2"} and edited == sorted(edited)
+    assert kpinfo.main([str(folder / "clip.kpc"), "--verify"]) == 0
+    checked = capsys.readouterr().err.splitlines()
+    assert checked[0].startswith("checking: 0/2 groups") and checked[-1].startswith("checking: 2/2 groups")
+
+
 @pytest.mark.parametrize("name", ["scene.kpc", "clip.kpc"])
 def test_texts_are_set_and_removed_and_all_chunks_are_copied(folder, name, capsys):
     texts = ["--title", "Tänzer", "--description", r"a\\n\nb", "--date", "2026-11", "--author", " "]

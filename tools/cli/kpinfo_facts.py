@@ -11,6 +11,7 @@ import numpy as np
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common import cli
 from kpc.format.common.errors import BudgetError, FormatError, KpcError, UsageError
+from kpc.format.common.progress import in_parts, progress
 from kpc.format.common.text import counted
 from kpc.format.container.clip_sound import SoundSpan, sound_spans
 from kpc.format.container.container import Codec, Entry
@@ -159,7 +160,7 @@ def _verify(groups: Groups, numbers: Sequence[int], info: dict[str, Any]) -> Non
         )
     errors, found = [], info["damaged_chunks"]
     groups.reader.source.will_read(0, groups.reader.source.size)
-    for number in numbers:
+    for number in progress(numbers, "checking", unit="groups"):
         damaged = _damaged_chunks(groups.open(number))
         errors += [error for *_, error in damaged]
         place = None if groups.is_single else number
@@ -191,7 +192,7 @@ def _damaged_chunks(reader: SceneReader) -> list[tuple[int, str, FormatError]]:
         FormatError: no chunk is damaged, but what they hold is not valid.
     """
     damaged = []
-    for number, entry in enumerate(reader.index):
+    for number, entry in in_parts(list(enumerate(reader.index))):
         try:
             reader.segment(number) if entry.kind == "PLNE" else reader.stored(number)
         except FormatError as error:

@@ -8,6 +8,7 @@ import numpy as np
 
 from kpc.format.coding.quantise import QuantisedScene
 from kpc.format.common.errors import FormatError, UsageError
+from kpc.format.common.progress import Progress, progress
 from kpc.format.container import groups, rewriting
 from kpc.format.container.groups import Span
 from kpc.format.container.rewriting import with_metadata
@@ -73,7 +74,8 @@ def edit(source: Path, output: Path, edits: Edits, metadata: Metadata) -> tuple[
             kept.append(span_s)
         return _retimed(_changed(scene, edits), edits)
 
-    data = edited(clip.open(0), change)
+    with Progress("editing", total=1, unit="scenes"):
+        data = edited(clip.open(0), change)
     if kept:
         metadata = _in_part(metadata, kept[0], clip.clip)
     return rewriting.save(with_metadata(data, metadata), output), kept[0] if kept else None
@@ -106,7 +108,7 @@ def _edit_groups(
         except FormatError as error:
             raise UsageError(f"--fps {edits.fps:g}: at this rate the groups have too few or too many frames") from error
     parts = []
-    for number, span in zip(numbers, spans, strict=True):
+    for number, span in progress(list(zip(numbers, spans, strict=True)), "editing", unit="groups"):
 
         def change(scene: QuantisedScene, span: Span = span) -> QuantisedScene:
             sound = scene.sound if edits.speed is None else None

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from kpc.format.coding.quantise import QuantisedScene, needed_texels
-from kpc.format.common.progress import progress
+from kpc.format.common.progress import in_parts
 from kpc.format.container.container import Chunk, Codec, Entry, assemble, store
 from kpc.format.container.rewriting import copied
 from kpc.format.container.scene_io import SceneReader, read
@@ -22,7 +22,8 @@ Place = tuple[str, int, int, int, int]
 def edited(reader: SceneReader, edit: Edit) -> bytes:
     """Return the file of a changed scene.
 
-    Chunks whose content stays the same are copied byte for byte, and so are those of kinds that are not known.
+    Chunks whose content stays the same are copied byte for byte, and so are those of kinds that are not known. Each is
+    reported as a part of a unit of progress.
 
     Raises:
         UsageError, FormatError: as `edit`, or no file can hold the result.
@@ -34,7 +35,7 @@ def edited(reader: SceneReader, edit: Edit) -> bytes:
     numbers = {_place_in(entry): number for number, entry in enumerate(reader.index)}
     old = {_place_in(chunk): chunk.raw for chunk in scene_chunks(before)}
     stored = []
-    for chunk in progress(scene_chunks(after), "editing", unit="chunks"):
+    for chunk in in_parts(scene_chunks(after)):
         place = _place_in(chunk)
         number = numbers.get(place)
         is_same = number is not None and old.get(place) == chunk.raw
