@@ -49,7 +49,11 @@ class CameraPath:
             at_s = view.at_s if view.at_s is not None else 0.0 if before is None else before + GAP_S
             if not 0.0 <= at_s <= MAX_DURATION_S or (before is not None and at_s <= before):
                 reason = "lies outside a day" if before is None else f"does not follow {before:g} s within a day"
-                raise DatasetError(f"keyframe {len(views) + 1} of the camera path is at {at_s:g} s, which {reason}")
+                remedy = "from 0 on" if before is None else f"above {before:g}"
+                raise DatasetError(
+                    f"keyframe {len(views) + 1} of the camera path is at {at_s:g} s, which {reason}; give it an `at` "
+                    f"{remedy}, up to {MAX_DURATION_S:g}"
+                )
             views.append(replace(view, at_s=at_s))
         for number, view in enumerate(views, 1):
             check_pose(f"keyframe {number} of the camera path", view.camera.camera_to_world)

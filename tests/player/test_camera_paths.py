@@ -159,7 +159,7 @@ MIRRORED = np.diag([-1.0, 1, 1, 1])
 
 
 @pytest.mark.parametrize(("poses", "ats", "words"), [
-    ([np.eye(4), np.eye(4)], [1.0, 1.0], "keyframe 2"),
+    ([np.eye(4), np.eye(4)], [1.0, 1.0], "give it an `at` above 1, up to 86400"),
     ([np.eye(4), np.eye(4)], [2.0, 1.0], "does not follow"),
     ([np.eye(4)], [-1.0], "keyframe 1"),
     ([np.eye(4)], [math.nan], "at is NaN"),

@@ -168,6 +168,7 @@ def test_names_and_poses_of_nerfstudio(run, scene_file: Path, tmp_path: Path) ->
     words = ["--cameras", listed, "--size", "8x6", "--backend", "reference", "-o", tmp_path / "out"]
     code, _, notes = run(scene_file, *words)
     assert code == 0 and "2 pictures get other names" in notes and "beginning of the clip" in notes
+    assert "beginning" not in run(scene_file, *words, "--time", 0)[2]
     assert sorted(p.name for p in (tmp_path / "out").glob("*.png")) == ["b_0007.png", "images_0007.png", "r_0.5.png"]
 
 
@@ -429,7 +430,7 @@ def test_unknown_appearances_are_refused(
         (["{scene}", "--cameras", "{nan}", "-o", "{dir}"], 1, "NaN"),
         (["{scene}", "--path", "{missing}", "-o", "{dir}"], 1, "missing.kpc"),
         (["{scene}", "--path", "{nan}", "-o", "{dir}"], 1, "NaN"),
-        (["{scene}", "--path", "{long}", "-o", "{dir}"], 2, "more than 100000 pictures"),
+        (["{scene}", "--path", "{long}", "-o", "{dir}"], 2, "more than 100,000 pictures"),
         (["{scene}", "--path", "x", "--orbit", "2", "-o", "{dir}"], 2, "not allowed"),
         (["{scene}", "--orbit", "2", "-o", "{text}/inside"], 2, "text.kpc: is a file"),
         (["{scene}", "--orbit", "2", "-o", "{dir}/no/such/a.mp4"], 2, "no/such: no such folder"),

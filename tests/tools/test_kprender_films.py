@@ -106,6 +106,8 @@ def test_a_clip_that_hardly_moves_has_too_many_pictures() -> None:
     with pytest.raises(UsageError, match="more than 100,000 pictures"):
         shots_of(replace(tiny_scene(4), clip=clip), clip, options, is_film=False)
     assert sample_at(clip.frame_count, clip.fps) == LAST_SAMPLE
+    options = parser().parse_args(["x.kpc", "-o", "x", "--frames", "99998-100001"])
+    assert len(shots_of(replace(tiny_scene(4), clip=clip), clip, options, is_film=False)) == 4
 
 
 @pytest.mark.parametrize(
@@ -126,6 +128,7 @@ def test_a_clip_that_hardly_moves_has_too_many_pictures() -> None:
         (["--time", 0.5, "--step", 3], "leave out --time or --step"),
         (["--orbit", 4, "--fps", 60], "--fps: --orbit says how many pictures"),
         (["-o", ""], "the name is empty"),
+        (["-o", "x.exr", "--depth", "--time", 0.5], "always hold the depth"),
         (["-o", "x.mp4", "--depth", "--matte"], "--depth: a film shows depth or --matte"),
         (["--step", 0], "--step"),
         (["--shutter", 1.5], "--shutter"),

@@ -61,7 +61,8 @@ def _command(argv: list[str]) -> None:
     _check(shots, output, options)
     if (note := rate_note(loaded.clip, options)) is not None:
         _say(note)
-    if options.cameras and loaded.clip.frame_count > 1 and not any(shots.time(number) for number in shots.numbers):
+    has_times = options.time is not None or any(shots.time(number) for number in shots.numbers)
+    if options.cameras and loaded.clip.frame_count > 1 and not has_times:
         _say(f"{options.cameras}: all views are at the beginning of the clip; --time chooses another time")
     render, renderer = renderer_of(loaded, options)
     _say(renderer)
@@ -128,6 +129,8 @@ def _check(shots: Shots, output: Output, options: argparse.Namespace) -> None:
     """Refuse several pictures for one file, pictures too large to render, and films of two things at once."""
     if options.depth and output.is_film and options.content in CUT_BY_THE_MATTE:
         raise UsageError(f"--depth: a film shows depth or {CUT_BY_THE_MATTE[options.content]}; leave one of them out")
+    if options.depth and output.suffix == ".exr":
+        raise UsageError("--depth: .exr pictures always hold the depth as channel Z; leave it out, or give .png")
     if not output.is_film and not output.is_folder and len(shots) != 1:
         raise UsageError(
             f"-o {output.path}: {len(shots)} pictures do not go into one file; give a folder, a film or --time"
@@ -181,7 +184,7 @@ def _write_pictures(
     if options.depth:
         unit = pictures.depth_unit(scene, [shots.camera(number) for number in shots.numbers])
     names = [shots.name(number) for number in shots.numbers]
-    paths, renamed = output.picture_paths(names, options.depth and output.suffix != ".exr")
+    paths, renamed = output.picture_paths(names, options.depth)
     if renamed:
         one, more = "gets another name, for its own is", "get other names, for theirs are"
         what = f"{one} taken or no plain file name" if len(renamed) == 1 else f"{more} taken or no plain file names"

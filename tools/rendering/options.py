@@ -129,7 +129,9 @@ def add_times(group: argparse._ArgumentGroup, is_rendering: bool = True) -> None
         type=functools.partial(cli.whole_number, low=1, high=MAX_PICTURES),
         default=1,
         metavar="N",
-        help="only every Nth frame" + "; a film still lasts as long" * is_rendering + " (default: %(default)s)",
+        help="only every Nth frame"
+        + "; a film plays as fast, and lasts as long to one of its frames" * is_rendering
+        + " (default: %(default)s)",
     )
 
 

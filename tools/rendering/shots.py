@@ -22,9 +22,10 @@ from kpc.format.scene.space import FARTHEST_CAMERA, edges_away
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.viewpoints import fit_camera, orbit
 
-# Limits of --fps and of the number of pictures.
+# Limits of --fps, of the number of pictures, and of the frames of a clip among which they are chosen.
 MIN_FPS, MAX_FPS = 0.001, 240.0
 MAX_PICTURES = 100_000
+MOST_FRAMES = 1e9
 # Instants at which a frame with an open shutter is rendered.
 SHUTTER_INSTANTS = 8
 # Frames by which a time may miss a frame and still mean it: rounding of seconds that were typed.
@@ -100,8 +101,6 @@ def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: boo
     is_still = options.time is not None and options.cameras is options.path is options.orbit is None
     _check_rate_and_step(options, is_still, is_film)
     timeline = replace(_timeline(scene, clip, options, is_film), is_stopped=options.time is not None)
-    if timeline.count > MAX_PICTURES:
-        raise UsageError(f"the clip has more than {MAX_PICTURES:,} pictures; choose a lower --fps, or --time")
     has_span = options.frames not in (None, (0, 0)) or options.start_s is not None or options.end_s is not None
     if is_still and has_span:
         raise UsageError(
@@ -125,7 +124,13 @@ def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: boo
         last = last if end_s is None else min(last, math.ceil(end_s * fps - SLACK) - 1)
         if first > last:
             raise UsageError(f"--from {start_s:g}s --to {end_s:g}s: no frame lies between them; swap or widen them")
-    return Shots(timeline, range(first, last + 1, options.step), fps / options.step, options.shutter)
+    numbers = range(first, last + 1, options.step)
+    if len(numbers) > MAX_PICTURES:
+        raise UsageError(
+            f"{len(numbers):,} frames are more than {MAX_PICTURES:,} pictures; choose fewer by --frames, --from "
+            "and --to, a larger --step, or a lower --fps"
+        )
+    return Shots(timeline, numbers, fps / options.step, options.shutter)
 
 
 def _check_rate_and_step(options: argparse.Namespace, is_still: bool, is_film: bool) -> None:
@@ -179,10 +184,6 @@ def _timeline(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bo
     if options.path is not None:
         path = CameraPath.load(options.path)
         duration_s = path.end_s - path.start_s
-        if duration_s * fps >= MAX_PICTURES:
-            raise UsageError(
-                f"--path {options.path}: {duration_s:g} s at {fps:g} fps are more than {MAX_PICTURES} pictures"
-            )
 
         def along(frame: float) -> tuple[Camera, float]:
             camera, time = path.at(path.start_s + frame / fps)
@@ -208,7 +209,7 @@ def _timeline(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bo
     if fixed_time is not None:
         return Timeline(1, fps, lambda frame: (camera, _clamped(fixed_time + frame * clip_frames / last_frame)))
     # A clip that is shorter than a frame has one, and one that hardly moves more than can be counted.
-    frames = min(clip.frame_count * fps / clip.fps, 2.0 * MAX_PICTURES) if clip.frame_count > 1 else 1.0
+    frames = min(clip.frame_count * fps / clip.fps, MOST_FRAMES) if clip.frame_count > 1 else 1.0
     count = max(1, math.ceil(frames - SLACK))
     return Timeline(count, fps, lambda frame: (camera, _clamped(frame * clip_frames / last_frame)))
 
