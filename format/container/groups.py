@@ -445,6 +445,18 @@ def _check_whole(source: Source) -> None:
         reader.stored(number)
 
 
+def check_checksums(groups: Groups) -> None:
+    """Check the CRC32C of every chunk of a file, those within groups first, so that an error names the smallest part.
+
+    Raises:
+        FormatError: one differs, or the file is cut off.
+    """
+    for number in range(len(groups)):
+        _check_whole(groups.source_of(number))
+    if not groups.is_single:
+        _check_whole(groups.reader.source)
+
+
 def check_spans(spans: Sequence[Span], names: str | Sequence[str]) -> None:
     """Check that the frames of groups make up a clip.
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from kpc.format.common.errors import FormatError
+from kpc.format.container import groups
 from kpc.format.container.rewriting import with_metadata
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Clip
@@ -268,6 +269,19 @@ def test_what_is_no_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtu
     (tmp_path / "a.kpc").write_bytes(b"no scene")
     assert kpshare.main([str(tmp_path / "a.kpc"), "-o", str(tmp_path / "site")]) == 1
     assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "site").exists()
+
+
+def test_a_clip_that_is_damaged_beyond_its_first_group_is_not_published(
+    tmp_path: Path, quick_posters: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clip = tmp_path / "clip.kpc"
+    groups.write([groups.GroupInput.of(SAMPLE, start) for start in (0, 30)], clip)
+    data = bytearray(clip.read_bytes())
+    data[-100] ^= 1
+    clip.write_bytes(data)
+    assert kpshare.main([str(clip), "-o", str(tmp_path / "site")]) == 1
+    said = capsys.readouterr().err
+    assert "clip.kpc, group 1: chunk " in said and "is damaged" in said and not (tmp_path / "site").exists()
 
 
 def read(url: str, **headers: str) -> tuple[bytes, dict[str, str]]:

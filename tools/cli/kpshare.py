@@ -23,6 +23,7 @@ from kpc.format.common.errors import NetworkError, UsageError
 from kpc.format.common.images import write_image
 from kpc.format.common.progress import progress
 from kpc.format.common.text import counted, escaped, notice
+from kpc.format.container.groups import Groups, check_checksums
 from kpc.format.container.http_address import Address, public_name
 from kpc.player.app.playlist import Playlist
 from kpc.player.sharing import site
@@ -141,6 +142,7 @@ def _inputs(options: argparse.Namespace) -> list[Path]:
 
 def _read(file: Path, name: str, poster: Path) -> SharedScene:
     """Read a scene, write its poster, and return what its page is to say."""
+    check_checksums(Groups(file))
     loaded = kpc.load(file)
     scene, _ = loaded.at(0.0)
     write_image(poster, render_poster(loaded), POSTER_QUALITY)
