@@ -84,13 +84,13 @@ def test_the_scene_places_cameras_both_ways(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_cameras_of_a_scene_come_back_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
-    metadata = Metadata({"up": [0, 0, 1], "camera_names": ["left", "right"]})
+    metadata = Metadata({"up": [0, 0, 1], "camera_names": ["left", "right café 2"]})
     scene = replace(tiny_scene(4), metadata=metadata)
     file, out = str(save(scene, tmp_path / "scene.kpc")), str(tmp_path / "out.json")
     assert kpexport.main([file, "-o", str(tmp_path / name)]) == 0
     assert "y is up, in units of the scene" in capsys.readouterr().err
-    assert kpexport.main([str(tmp_path / name), "-o", out, "--scene", file, "--camera", "right"]) == 0
-    assert_same(load_views(out), [View(kpc.load(file).cameras[1], 0.0, "right.png")])
+    assert kpexport.main([str(tmp_path / name), "-o", out, "--scene", file, "--camera", "right café 2"]) == 0
+    assert_same(load_views(out), [View(kpc.load(file).cameras[1], 0.0, "right café 2.png")])
 
 
 @pytest.mark.parametrize("name", FORMATS[:2])
@@ -99,6 +99,15 @@ def test_another_size_keeps_the_vertical_field_of_view_and_the_shape_of_pixels(t
     save_views(tmp_path / "in.json", before)
     wanted = [replace(view, camera=fit_camera(view.camera, 320, 90)) for view in before]
     assert_same(exchange(tmp_path, name, back=("--size", "320x90")), wanted)
+
+
+def test_usd_cameras_that_are_renamed_have_their_new_names(tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed, which reads and writes USD")
+    save_views(tmp_path / "in.json", [replace(view, file=f"eye {n}.png") for n, view in enumerate(views(False))])
+    assert [view.file for view in exchange(tmp_path, "a.usda")] == ["eye 0.png", "eye 1.png", "eye 2.png"]
+    (tmp_path / "a.usda").write_text((tmp_path / "a.usda").read_text().replace("eye_1", "main"))
+    assert kpexport.main([str(tmp_path / "a.usda"), "-o", str(tmp_path / "out.json")]) == 0
+    assert [view.file for view in load_views(tmp_path / "out.json")] == ["eye 0.png", "main.png", "eye 2.png"]
 
 
 def test_a_gltf_camera_is_valid_and_can_be_edited(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """Cameras to and from USD (usd-core): focal lengths, apertures and offsets of the film back, with time samples.
 
 A stage is y-up, in metres. Apertures and focal lengths count as millimetres; the width of the film back is that of
-35 mm film. The attribute `kpc:size` holds the size of the pictures in pixels, and `kpc:time` the clip's time.
+35 mm film. The attribute `kpc:size` holds the size of the pictures in pixels, `kpc:time` the clip's time, and
+`kpc:name` the name of a camera where USD cannot have it.
 
     focalLength / horizontalAperture = fl_x / width     horizontalApertureOffset / horizontalAperture = 1/2 - cx / width
     focalLength / verticalAperture = fl_y / height      verticalApertureOffset / verticalAperture = cy / height - 1/2
@@ -17,7 +18,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom
 
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import DatasetError, MediaError
-from kpc.format.common.text import check_unicode
+from kpc.format.common.text import check_unicode, valid_unicode
 from kpc.format.scene.camera_checks import check_lens, check_pose
 from kpc.format.scene.cameras import Camera, View
 from kpc.tools.exchange.camera_tracks import MAX_VIEWS, Track, fitted, size_for
@@ -52,7 +53,7 @@ def write_usd_cameras(path: Path, tracks: Sequence[Track], fps: float) -> None:
     stage.SetDefaultPrim(root.GetPrim())
     used = set[str]()
     for number, track in enumerate(tracks):
-        name = re.sub(r"\W", "_", track.name, flags=re.ASCII)[:100]
+        name = _identifier(track.name)
         if not name or name[0].isdigit() or name in used:
             name = f"camera_{number:04d}_{name}"
         used.add(name)
@@ -105,12 +106,19 @@ def read_usd_cameras(path: Path, size: tuple[int, int] | None) -> tuple[list[Tra
     return tracks, sorted(guessed)
 
 
+def _identifier(name: str) -> str:
+    """Return what of a camera's name USD can have, which may be empty or begin with a digit."""
+    return re.sub(r"\W", "_", name, flags=re.ASCII)[:100]
+
+
 def _define(prim: UsdGeom.Camera, track: Track, fps: float) -> None:
     """Set the attributes of a camera, with a time sample for each instant if it moves."""
     prim.CreateClippingRangeAttr(Gf.Vec2f(NEAR, FAR))
     first = track.views[0].camera
     size = prim.GetPrim().CreateAttribute("kpc:size", Sdf.ValueTypeNames.Int2)
     size.Set(Gf.Vec2i(first.width, first.height))
+    if prim.GetPrim().GetName() != track.name:
+        prim.GetPrim().CreateAttribute("kpc:name", Sdf.ValueTypeNames.String).Set(valid_unicode(track.name))
     pose = prim.AddTransformOp()
     time = prim.GetPrim().CreateAttribute("kpc:time", Sdf.ValueTypeNames.Double)
     attributes = (
@@ -152,7 +160,7 @@ def _track(
         guessed.add("there are no times of the clip: it plays once along the path" if codes else "all times are 0")
     stored = prim.GetAttribute("kpc:size")
     stored_size = [int(n) for n in stored.Get()] if stored and stored.GetTypeName() == Sdf.ValueTypeNames.Int2 else None
-    name, views = prim.GetName(), []
+    name, views = _name(prim), []
     for number, code in enumerate([Usd.TimeCode(code) for code in codes] or [Usd.TimeCode.Default()]):
         focal, film_width, film_height, shift_x, shift_y = (
             _number(where, attribute, code)
@@ -178,6 +186,13 @@ def _track(
         made = Camera(width, height, fl_x, fl_y, cx, cy, check_pose(where, _pose(where, stage, camera, code)))
         views.append(View(fitted(made, size), at, file, at_s))
     return Track(name, tuple(views))
+
+
+def _name(prim: Usd.Prim) -> str:
+    """Return the name of a camera: the one that `kpc:name` holds, unless another program has renamed it since."""
+    stored = prim.GetAttribute("kpc:name")
+    name = str(stored.Get() or "")[:200] if stored and stored.GetTypeName() == Sdf.ValueTypeNames.String else ""
+    return name if name and prim.GetName().endswith(_identifier(name)) else str(prim.GetName())
 
 
 def _codes(where: str, camera: UsdGeom.Camera) -> list[float]:
