@@ -1,9 +1,9 @@
 """Sequential fine-tuning: planes are coded group by group, and what is not yet coded is trained to compensate.
 
 Pictures show the product of all planes, so that an error in one can be compensated by the others, at least in part. The
-finest planes, which take most of the bytes, are coded first. Then all others and the decoder learn to reproduce the
-colours of the uncoded scene on random rays of its cameras; then the next group is coded, and so on. The decoder
-learns on when all planes are coded. No filmed pictures are needed.
+finest planes, which take most of the bytes, are coded first, those of what stands still and of what moves together.
+Then all others and the decoder learn to reproduce the colours of the uncoded scene on random rays of its cameras; then
+the next group is coded, and so on. The decoder learns on when all planes are coded. No filmed pictures are needed.
 
 This is incremental network quantisation (Zhou et al., arXiv:1702.03044) applied to planes. Why it pays, and what it
 gains: docs/design/rate-distortion.md, "Sequential fine-tuning".
@@ -38,10 +38,30 @@ CodePlanes = Callable[[Scene, Sequence[PlaneKey]], Mapping[PlaneKey, np.ndarray]
 
 
 def coding_order(scene: Scene) -> list[list[PlaneKey]]:
-    """Return the groups of planes in coding order: each space plane alone, finest scale first, then the time planes."""
-    finest_first = list(reversed(range(len(scene.scales))))
-    groups = [[(s, name)] for s in finest_first for name in SPACE_PLANES]
-    return groups + [[(s, name) for name in TIME_PLANES] for s in finest_first if scene.is_dynamic]
+    """Return the groups of planes in coding order: each kind of space plane alone, finest scales first, then the time
+    planes.
+    """
+    finest_first = scales_by_resolution(scene)[::-1]
+    groups = [[(s, name) for s in scales] for scales in finest_first for name in SPACE_PLANES]
+    if scene.is_dynamic:
+        groups += [[(s, name) for s in scales for name in TIME_PLANES] for scales in finest_first]
+    return groups
+
+
+def scales_by_resolution(scene: Scene) -> list[list[int]]:
+    """Return the scales that are coded together: one in which nothing changes, and the next, which holds what moves at
+    that resolution; any other alone.
+    """
+    found: list[list[int]] = []
+    for s in range(len(scene.scales)):
+        follows_still = found and _stands_still(scene, found[-1][-1]) and not _stands_still(scene, s)
+        found = [*found[:-1], [*found[-1], s]] if follows_still else [*found, [s]]
+    return found
+
+
+def _stands_still(scene: Scene, s: int) -> bool:
+    """Return whether the time planes of a scale are the identity; False in scenes that have none."""
+    return scene.is_dynamic and all((scene.scales[s][name] == 1).all() for name in TIME_PLANES)
 
 
 def step_factors(scene: Scene) -> dict[PlaneKey, float]:

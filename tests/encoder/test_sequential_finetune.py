@@ -57,6 +57,9 @@ def test_every_plane_is_coded_once_the_finest_first() -> None:
     assert sorted(plane for group in groups for plane in group) == sorted(
         (s, name) for s in range(3) for name in scene.scales[s]
     )
+    both = coding_order(with_moving_area(scene))  # scales 1 and 2 are of one resolution to it
+    assert [{s for s, _ in group} for group in both] == [{1, 2}] * 3 + [{0}] * 3 + [{1, 2}, {0}]
+    assert sorted(plane for group in both for plane in group) == sorted(plane for group in groups for plane in group)
     assert coding_order(tiny_scene(dynamic=False, scales=1)) == [[(0, "xy")], [(0, "xz")], [(0, "yz")]]
 
 
