@@ -181,6 +181,24 @@ def test_all_faults_are_found_at_once(tmp_path: Path, take: Path) -> None:
     assert len(error.value.faults) == 3
 
 
+def test_each_fault_of_an_option_stands_in_its_line(tmp_path: Path, take: Path) -> None:
+    """Though the parser of options names only the first, and a grid makes many jobs of it."""
+    options = '[options]\npresett = "fast"\nsteps = -4\nquality = 900\n[resources]\ncores = "two"\nram = 1\n'
+    text = f'output = "out"\n{options}[grid]\nseed = [1, 2]\nquality = [20, 900]\n[[scene]]\nsource = "take"\n'
+    with pytest.raises(FaultyBatch) as error:
+        jobs.read_jobs(write(tmp_path, text))
+    words = {3: "--presett", 4: "--steps", 7: "cores = 'two'", 8: "'ram' is not", 11: "--quality"}
+    said = dict(fault.removeprefix(f"{tmp_path}/jobs.toml:").split(": ", 1) for fault in error.value.faults)
+    assert {int(line) for line in said} == set(words) and len(error.value.faults) == len(words)
+    assert all(word in said[str(line)] for line, word in words.items())
+
+
+def test_options_that_exclude_each_other_stand_in_the_line_of_one(tmp_path: Path, take: Path) -> None:
+    text = 'output = "out"\n[[scene]]\nsource = "take"\noptions.time_budget = "1m"\noptions.steps = 4\n'
+    with pytest.raises(FaultyBatch, match=r"toml:5: --steps and --time-budget both say"):
+        jobs.read_jobs(write(tmp_path, text))
+
+
 def test_a_source_is_never_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = tmp_path / "a.kpc"
     shutil.copyfile(SAMPLE, scene)

@@ -20,11 +20,14 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
 from kpc.tools.batch.toml_lines import TomlLines
+
+if TYPE_CHECKING:
+    from kpc.encoder.cli.options import Options
 
 # Options of kpenc that a batch sets itself, or that make no sense in one: fields of kpenc's options, and all others.
 REFUSED_FIELDS = ("output", "work", "keep", "resume", "only", "preview", "keep_checkpoint")
@@ -133,7 +136,10 @@ def read_jobs(path: Path, place: str | None = None) -> Batch:
     common = {table: _table(document, table, lines.of(table), faults) for table in TABLES}
     for key, values in common["grid"].items():
         if not isinstance(values, list) or not values:
-            faults.add(lines.of(key), f"{key} in the grid is not a list; write for example {key} = [40, 70, 100]")
+            faults.add(
+                lines.of(key, tables=("grid",)),
+                f"{key} in the grid is not a list; write for example {key} = [40, 70, 100]",
+            )
             common["grid"][key] = [values]
     jobs: list[Job] = []
     for number, scene in enumerate(scenes):
@@ -224,43 +230,49 @@ def _jobs_of(
         faults.add(lines.of("name", number), f"name = {name!r}: {found}which has letters, digits, and . _ + - only")
         return
     own = _table(scene, "options", where, faults)
-    resources = _resources(common["resources"] | _table(scene, "resources", where, faults), where, faults)
+    taken = common["resources"] | _table(scene, "resources", where, faults)
+    resources = _resources(taken, number, lines, faults)
     grid = {key: value for key, value in common["grid"].items() if key not in own}
     for point in itertools.product(*grid.values()):
         chosen = dict(zip(grid, point, strict=True))
         options = common["options"] | chosen | own
         parts = [name, *(f"{key}-{UNSAFE.sub('_', str(value))}" for key, value in chosen.items())]
         words = _words(options, number, lines, faults)
-        yield _checked(Job(".".join(parts), source, words, resources=resources, where=where), faults)
+        yield _checked(Job(".".join(parts), source, tuple(words), resources=resources, where=where), faults, words)
 
 
-def _words(options: Mapping[str, Any], number: int, lines: TomlLines, faults: Faults) -> tuple[str, ...]:
-    """Return options as words of a command line: those that are true without a value, and none that are false."""
-    words = []
+def _words(options: Mapping[str, Any], number: int, lines: TomlLines, faults: Faults) -> dict[str, str]:
+    """Return options as words of a command line, and where each stands: those that are true without a value, and none
+    that are false."""
+    words = {}
     for key, value in options.items():
-        name = key.replace("_", "-")
+        name, where = key.replace("_", "-"), lines.of(key, number, ("grid", "options"))
         if name.replace("-", "_") in REFUSED:
-            faults.add(lines.of(key, number), f"{key}: {A_BATCHS_OWN}")
+            faults.add(where, f"{key}: {A_BATCHS_OWN}")
         elif value is True:
-            words.append(f"--{name}")
+            words[f"--{name}"] = where
         elif isinstance(value, list) and value and all(isinstance(one, int | float) for one in value):
-            words.append(f"--{name}={','.join(map(str, value))}")
+            words[f"--{name}={','.join(map(str, value))}"] = where
         elif isinstance(value, str | int | float) and value is not False:
-            words.append(f"--{name}={value}")
+            words[f"--{name}={value}"] = where
         elif value is not False:
-            faults.add(lines.of(key, number), f"{key}: {value!r} is not a value of an option")
-    return tuple(words)
+            faults.add(where, f"{key}: {value!r} is not a value of an option")
+    return words
 
 
-def _resources(given: Mapping[str, Any], where: str, faults: Faults) -> Resources:
+def _resources(given: Mapping[str, Any], number: int, lines: TomlLines, faults: Faults) -> Resources:
     """Return the resources that a table names."""
+
+    def add(key: str, text: str) -> None:
+        faults.add(lines.of(key, number, ("resources",)), text)
+
     for key in given.keys() - {"cores", "memory", "gpus"}:
-        faults.add(where, f"{key!r} is not a resource; known are cores, memory and gpus")
+        add(key, f"{key!r} is not a resource; known are cores, memory and gpus")
     counts = {}
     for key, least in ("cores", 1), ("gpus", 0):
         value = given.get(key, least)
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            faults.add(where, f"{key} = {value!r} is not a whole number from {least} on")
+            add(key, f"{key} = {value!r} is not a whole number from {least} on")
             value = least
         counts[key] = value
     memory = 0
@@ -268,39 +280,70 @@ def _resources(given: Mapping[str, Any], where: str, faults: Faults) -> Resource
         try:
             memory = cli.byte_count(str(given["memory"]))
         except Exception as error:  # argparse's, which has the words
-            faults.add(where, f"memory: {error}")
+            add("memory", f"memory: {error}")
     return Resources(counts["cores"], memory, counts["gpus"])
 
 
-def _checked(job: Job, faults: Faults) -> Job:
-    """Check a job's options by kpenc's own parser, and that a source on this machine is a folder that holds something
-    to encode, or a file that begins and ends as those that are coded anew; return the job with what the options say
-    about groups."""
-    from kpc.encoder.cli import options as kpenc  # loads PyTorch, which workers need not
-    from kpc.encoder.cli.read_dataset import check_folder
+def _checked(job: Job, faults: Faults, places: Mapping[str, str] | None = None) -> Job:
+    """Check a job as a whole, before anything starts.
+
+    Its options are checked by kpenc's own parser. A source on this machine must be a folder that holds something to
+    encode, or a file that begins and ends as those that are coded anew.
+
+    Args:
+        job: to be checked.
+        faults: gets what is wrong.
+        places: the job's options, and the file and line of each; None if they stand where the job does.
+
+    Returns:
+        The job with what the options say about groups.
+    """
+    from kpc.encoder.cli.read_dataset import check_folder  # loads PyTorch, which workers need not
     from kpc.encoder.cli.transcode import open_source
 
     if ADDRESS.match(job.source) and job.source.endswith(".kpc"):
         return job  # its options are checked once the file is there
-    source, said = "folder" if ADDRESS.match(job.source) else job.source, io.StringIO()
-    output = Path(".kpbatch", "scene.kpc")
+    source, places = "folder" if ADDRESS.match(job.source) else job.source, places or {}
     try:
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
-            options, is_plan, is_json = kpenc.parse([source, "-o", str(output), *job.options])
-        plain = kpenc.Options(options.source, output)
-        given = [name for name in REFUSED_FIELDS if getattr(options, name) != getattr(plain, name)]
-        for name in given + ["dry_run"] * is_plan + ["json"] * is_json:
-            faults.add(job.where, f"--{name.replace('_', '-')}: {A_BATCHS_OWN}")
+        options, wrong = _parsed(source, job.options)
+        # The parser names only the first option that it refuses; some are refused only beside others.
+        alone = (
+            [(place, fault) for word, place in places.items() for fault in _parsed(source, [word])[1]] if wrong else []
+        )
+        for place, fault in alone or [(_place_of(fault, places) or job.where, fault) for fault in wrong]:
+            faults.add(place, fault)
+        if options is None:
+            return job
         if not ADDRESS.match(job.source):
             check = open_source if options.source.is_file() else check_folder
             check(options)
         return replace(job, group=options.group_s is not None)
-    except SystemExit as stop:
-        message = said.getvalue().strip().rsplit("error: ", 1)[-1]
-        faults.add(job.where, message if stop.code else f"--help and --version: {A_BATCHS_OWN}")
     except (KpcError, OSError) as error:
         faults.add(job.where, (cli.message_of(error) or str(error)).removeprefix(f"{job.source}: "))
     return job
+
+
+def _parsed(source: str, words: Sequence[str]) -> tuple["Options | None", list[str]]:
+    """Parse words by kpenc's own parser; return its options, None if it refuses them, and what is wrong with them."""
+    from kpc.encoder.cli import options as kpenc
+
+    said, output = io.StringIO(), Path(".kpbatch", "scene.kpc")
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            options, is_plan, is_json = kpenc.parse([source, "-o", str(output), *words])
+    except SystemExit as stop:
+        message = said.getvalue().strip().rsplit("error: ", 1)[-1]
+        return None, [message if stop.code else f"--help and --version: {A_BATCHS_OWN}"]
+    plain = kpenc.Options(options.source, output)
+    given = [name for name in REFUSED_FIELDS if getattr(options, name) != getattr(plain, name)]
+    given += ["dry_run"] * is_plan + ["json"] * is_json
+    return options, [f"--{name.replace('_', '-')}: {A_BATCHS_OWN}" for name in given]
+
+
+def _place_of(fault: str, places: Mapping[str, str]) -> str | None:
+    """Return where the option stands that a fault names at its beginning."""
+    named = re.match(r"(?:argument )?(--[\w-]+)", fault)
+    return next((place for word, place in places.items() if named and word.split("=")[0] == named[1]), None)
 
 
 def _check_names(jobs: Sequence[Job], remedy: str, faults: Faults) -> None:

@@ -4,7 +4,8 @@ import re
 from pathlib import Path
 
 HEADER = re.compile(r"\s*\[\[?\s*([\w.-]+)\s*\]\]?")
-KEY = re.compile(r"""\s*["']?([\w-]+)["']?\s*(?:\.[\w."'-]+\s*)?=""")
+# A key, and the last part of one that has dots.
+KEY = re.compile(r"""\s*["']?([\w-]+)["']?\s*(?:\.\s*["']?([\w-]+)["']?\s*)*=""")
 
 
 class TomlLines:
@@ -12,25 +13,36 @@ class TomlLines:
 
     def __init__(self, path: Path, text: str) -> None:
         self._path = path
-        # Lines of keys outside arrays of tables, and for each [[scene]], its line and those of its keys.
-        self._keys: dict[str, int] = {}
+        # Lines of keys of each table outside arrays of tables, "" without one; those of headers are there, too. And for
+        # each [[scene]], its line and those of its keys.
+        self._tables: dict[str, dict[str, int]] = {"": {}}
         self._scenes: list[tuple[int, dict[str, int]]] = []
-        is_scene = False
+        table = ""
         for number, line in enumerate(text.splitlines(), 1):
             if header := HEADER.match(line):
-                is_scene = header[1].split(".")[0] == "scene"
-                if line.lstrip().startswith("[[") and is_scene:
+                table = header[1].split(".")[0]
+                if line.lstrip().startswith("[[") and table == "scene":
                     self._scenes.append((number, {}))
-                self._keys.setdefault(header[1].split(".")[0], number)
+                self._tables[""].setdefault(table, number)
                 continue
-            keys = self._scenes[-1][1] if is_scene and self._scenes else self._keys
-            for key in KEY.findall(line) + re.findall(r"[{,]\s*([\w-]+)\s*=", line):
+            own = self._tables.setdefault(table, {})
+            keys = self._scenes[-1][1] if table == "scene" and self._scenes else own
+            parts = found.groups("") if (found := KEY.match(line)) else ()
+            for key in (*filter(None, parts), *re.findall(r"[{,]\s*([\w-]+)\s*=", line)):
                 keys.setdefault(key, number)
 
-    def of(self, key: str, scene: int | None = None) -> str:
-        """Return "FILE:LINE" of a key: of the scene of that number if it has it, else of a table before."""
-        line = self._keys.get(key, 1)
+    def of(self, key: str, scene: int | None = None, tables: tuple[str, ...] = ("",)) -> str:
+        """Return "FILE:LINE" of a key.
+
+        Args:
+            key: its name, or that of a table.
+            scene: the number of a [[scene]]; its own keys come first.
+            tables: where else the key may stand, the first of them that has it; "" is outside of tables, where a table
+                in braces has its keys, too.
+        """
+        places = [self._tables.get(table, {}) for table in (*tables, "")]
+        line = 1
         if scene is not None and scene < len(self._scenes):
-            start, keys = self._scenes[scene]
-            line = start if key == "scene" else keys.get(key, self._keys.get(key, start))
-        return f"{self._path}:{line}"
+            line, own = self._scenes[scene]
+            places = [] if key == "scene" else [own, *places]
+        return f"{self._path}:{next((keys[key] for keys in places if key in keys), line)}"
