@@ -166,12 +166,15 @@ def prepare_trainer(options: Options, setting: Setting) -> Trainer:
         config = replace(config, moving_area=moving.box)
     trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s, mapping=mapping, moving=moving)
     log(*describe_model(trainer).split("\n"))
+    changed = ""
     if resumes:
-        trainer.resume(checkpoint)
+        changed = trainer.resume(checkpoint, options.time_budget_s)
     elif setting.before is not None:
         initialise_from(trainer.field, setting.before)
     if options.resume:
         log(f"resumed at step {trainer.step}" if trainer.step else f"{checkpoint}: no checkpoint yet; starting afresh")
+    if changed:
+        log(f"length: {changed}; what is left is trained at the rates of a run of the new length")
     return trainer
 
 

@@ -15,7 +15,7 @@ import torch
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.appearances import assign_appearances
 from kpc.encoder.field.bounds import visible_cells
-from kpc.encoder.field.config import PRESETS, TrainConfig
+from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, HybridField, SummedField
 from kpc.encoder.field.fused import log_densities
 from kpc.encoder.field.layout import motion_grid_shape, plan_layout
@@ -23,6 +23,7 @@ from kpc.encoder.field.occupancy_grid import OccupancyGrid, grid_shape
 from kpc.encoder.field.priors import appearance_priors, motion_priors, plane_priors
 from kpc.encoder.field.proposals import Proposals
 from kpc.encoder.training.checkpoint import save_state
+from kpc.encoder.training.continuation import describe_length, name_changes
 from kpc.encoder.training.fused_optimiser import FusedOptimiser
 from kpc.encoder.training.importance import TileWeights, has_static_cameras
 from kpc.encoder.training.moving_area import MovingArea
@@ -135,6 +136,7 @@ class Trainer:
         self._weights: TileWeights | None = None
         self._has_weights = has_static_cameras(dataset)
         self._steady_rays, self._steady_s = 0, 0.0
+        self._time_budget_s: float | None = None
 
     def run(
         self,
@@ -159,7 +161,7 @@ class Trainer:
             TrainingError: the loss is not finite.
             KeyboardInterrupt: `interrupted()` returned True.
         """
-        config = self.config
+        config, self._time_budget_s = self.config, time_budget_s
         saved, error, drawn, since = time.monotonic(), 0.0, 0, time.monotonic()
         while (fraction := self._fraction(time_budget_s, most_steps)) < 1:
             if interrupted():
@@ -349,12 +351,10 @@ class Trainer:
         Raises:
             TrainingError: the file cannot be written; an earlier checkpoint is left unchanged.
         """
-        state = {
-            "config": asdict(self.config),
-            "aabb": torch.from_numpy(self.aabb),
+        state = self._settings() | {
             "step": self.step,
+            "time_budget_s": self._time_budget_s,
             "elapsed_s": self.elapsed_s,
-            "mapping": repr(self.mapping),
             "samples_per_ray": self.samples_per_ray,
             "field": self.field.state_dict(),
             "optimiser": self.optimiser.state(),
@@ -365,16 +365,12 @@ class Trainer:
         }
         save_state(path, state, "give another folder with --work")
 
-    def _changes(self, state: dict[str, Any]) -> str:
-        """Return the settings in which a checkpoint differs from this run, with both values; empty where in none."""
-        before, now = (_named(_comparable(config)) for config in (state["config"], asdict(self.config)))
-        box, mapping = state["aabb"].cpu().numpy().tolist(), state.get("mapping")
-        before |= {"--space": mapping, "--box": box}
-        now |= {"--space": repr(self.mapping), "--box": self.aabb.tolist()}
-        changed = [name for name in now if before.get(name) != now[name]]
-        if before["--preset"] != now["--preset"]:  # which differ in many numbers
-            changed = [name for name in changed if name.startswith("--")]
-        return "; ".join(f"{name} was {before.get(name)}, is {now[name]}" for name in changed)
+    def _settings(self) -> dict[str, Any]:
+        return {
+            "config": asdict(self.config),
+            "aabb": torch.from_numpy(self.aabb),
+            "mapping": repr(self.mapping),
+        }
 
     def _try_to_save(self, path: Path) -> None:
         try:
@@ -382,15 +378,25 @@ class Trainer:
         except TrainingError as error:
             print(f"{error}; training goes on", file=sys.stderr, flush=True)
 
-    def resume(self, path: Path) -> None:
+    def resume(self, path: Path, time_budget_s: float | None = None) -> str:
         """Continue from a checkpoint of the same dataset and configuration, to bitwise the same result.
 
+        The length of the run may be another one, whose schedule then holds for the steps that are left.
+
+        Args:
+            path: of the checkpoint.
+            time_budget_s: for how long this run is to train, seconds; None for `config.steps`.
+
+        Returns:
+            How the length differs, in words; empty where it does not.
+
         Raises:
-            TrainingError: the checkpoint cannot be read, or belongs to another run.
+            TrainingError: the checkpoint cannot be read, belongs to another run, or leaves nothing to train of another
+                length.
         """
         try:
             state = _load(path, self.device)
-            if changed := self._changes(state):
+            if changed := name_changes(state, self._settings()):
                 raise TrainingError(
                     f"{path}: belongs to a run with other settings ({changed}); give the same ones or drop --resume"
                 )
@@ -407,6 +413,15 @@ class Trainer:
             self.rng.bit_generator.state = _rng_from_plain(state["rng"])
             self.step, self.elapsed_s = state["step"], state["elapsed_s"]
             self.samples_per_ray = state["samples_per_ray"]
+            before = describe_length(state["config"]["steps"], state.get("time_budget_s"))
+            now = describe_length(self.config.steps, time_budget_s)
+            changed = "" if before == now else f"{before} before, {now} now"
+            if changed and self._fraction(time_budget_s, None) >= 1:
+                raise TrainingError(
+                    f"{path}: has {self.step} steps of {self.elapsed_s:.0f} s already ({changed}), so that nothing is "
+                    "left to train; give more, or drop --resume"
+                )
+            return changed
         except TrainingError:
             raise
         except Exception as error:  # a damaged file may raise anything
@@ -416,20 +431,6 @@ class Trainer:
 def _refinement_rate(fraction: float) -> float:
     """Return the share of the peak learning rates of cameras at a fraction of the run."""
     return 0.5 * (1 + math.cos(math.pi * fraction))
-
-
-def _named(config: dict[str, Any]) -> dict[str, Any]:
-    """Return the parts of a configuration by the options of kpenc that set them, all others by their own names."""
-    named = {
-        "--preset": min(PRESETS, key=lambda name: len(asdict(PRESETS[name]).items() - config.items())),
-        "--decoder": "hybrid" if config["hybrid"] else "explicit",
-        "--sampling": "proposals" if config["proposals"] else "grid",
-        "--seed": config["seed"],
-        "--appearance": config["appearance"],
-        "--refine": config["refine"],
-    }
-    own = ("hybrid", "proposals", "seed", "appearance", "refine")
-    return named | {name: value for name, value in config.items() if name not in own}
 
 
 def load_checkpoint_box(path: Path) -> np.ndarray:
@@ -454,15 +455,6 @@ def _load(path: Path, device: torch.device) -> dict[str, Any]:
 
 def _unusable(path: Path, error: Exception) -> TrainingError:
     return TrainingError(f"{path}: not a usable checkpoint ({type(error).__name__}); delete it to start afresh")
-
-
-def _comparable(config: dict[str, Any]) -> dict[str, Any]:
-    """Return a configuration without what may differ between a run and its continuation."""
-    return {
-        key: tuple(value) if isinstance(value, list) else value
-        for key, value in config.items()
-        if key not in ("steps", "prune_share", "tune_steps", "thorough_from")
-    }
 
 
 def _fingerprint(dataset: Dataset) -> str:

@@ -356,13 +356,13 @@ def test_resume_with_other_settings(run: Kpenc, sets: Path, tmp_path: Path) -> N
     assert run(sets / "n3dv", "--steps", "2", "--keep", "--box", "-1,-1,-1,1,1,1")[0] == 0
     kept = (tmp_path / "out.kpc").read_bytes()
     changed = ("--seed", "7", "--decoder", "hybrid"), "(--decoder was explicit, is hybrid; --seed was 0, is 7)"
-    for options, words in (changed, (("--holdout", "none"), "other pictures")):
+    shorter = ("--steps", "1"), "already (--steps 2 before, --steps 1 now), so that nothing is left"
+    for options, words in (changed, shorter, (("--holdout", "none"), "other pictures")):
         code, _, err = run(sets / "n3dv", "--steps", "3", "--resume", "--box", "-1,-1,-1,1,1,1", *options)
         assert code == 1 and words in err.splitlines()[-1] and CHECKPOINT in err
     (tmp_path / "out.kpc.work" / CHECKPOINT).write_bytes(b"damaged")
     code, _, err = run(sets / "n3dv", "--steps", "3", "--resume")
-    assert code == 1 and "delete it" in err and "Traceback" not in err
-    assert (tmp_path / "out.kpc").read_bytes() == kept
+    assert code == 1 and "delete it" in err and (tmp_path / "out.kpc").read_bytes() == kept
 
 
 def test_a_killed_process_resumes(sets: Path, tmp_path: Path, run: Kpenc) -> None:
@@ -382,8 +382,8 @@ def test_a_killed_process_resumes(sets: Path, tmp_path: Path, run: Kpenc) -> Non
     process.stderr.close()
     assert not output.exists()
     state = torch.load(checkpoint, weights_only=True)
-    code, out, err = run(sets / "blender", "--resume", "--json", "--steps", str(state["step"] + 3))
-    assert code == 0 and f"resumed at step {state['step']}" in err and json.loads(out)["steps"] == state["step"] + 3
+    code, out, err = run(sets / "blender", "--resume", "--json", "--steps", f"{(steps := state['step'] + 3)}")
+    assert code == 0 and f"--steps 1000000 before, --steps {steps} now" in err and json.loads(out)["steps"] == steps
     assert {p.name for p in tmp_path.iterdir()} == {"out.kpc"}
 
 
