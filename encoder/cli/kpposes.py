@@ -14,6 +14,8 @@ import sys
 from pathlib import Path
 
 from kpc.encoder.datasets.layouts.nerfstudio import MADE_BY
+from kpc.encoder.datasets.layouts.nerfstudio import NAME as NERFSTUDIO
+from kpc.encoder.datasets.loading import layouts_of
 from kpc.encoder.evaluation.camera_page import check_page
 from kpc.encoder.poses.document import write_document
 from kpc.encoder.poses.find import Found, find_poses
@@ -21,7 +23,7 @@ from kpc.encoder.poses.page import NAME, write_page
 from kpc.encoder.poses.wishes import add_pose_options, wishes_from
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
-from kpc.format.common.text import escaped
+from kpc.format.common.text import escaped, notice
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -31,6 +33,11 @@ def main(argv: list[str] | None = None) -> int:
 
 def _command(argv: list[str]) -> None:
     options = _parser().parse_args(argv)
+    if not options.folder.is_dir():
+        problem = "is a file, not a folder" if options.folder.exists() else "no such folder"
+        raise UsageError(
+            f"{options.folder}: {problem}; give a folder of videos, of folders of frames, or of photographs"
+        )
     file = options.output or options.folder / "transforms.json"
     cli.check_writable(file)
     _refuse_other_document(file)
@@ -38,6 +45,7 @@ def _command(argv: list[str]) -> None:
     check_page(page)
     found = find_poses(options.folder, wishes_from(options))
     write_document(found, options.folder, file)
+    _say_if_not_read(options.folder, file)
     write_page(found, f"Cameras of {options.folder.resolve().name}", page)
     print(report(found))
     print(escaped(f"{page}: where the cameras stand, and what they see"))
@@ -76,6 +84,16 @@ def _refuse_other_document(file: Path) -> None:
         document = None
     if not isinstance(document, dict) or document.get("made_by") != MADE_BY:
         raise UsageError(f"{file}: is not a document of kpposes and stays; move it, or choose another name with -o")
+
+
+def _say_if_not_read(folder: Path, file: Path) -> None:
+    """Say that kpenc reads other poses of the folder, if there are any, and not the document."""
+    layouts = layouts_of(folder) if file.resolve() == folder.resolve() / "transforms.json" else []
+    if layouts and layouts[0].NAME != NERFSTUDIO:
+        notice(
+            f"{file}: warning: kpenc reads the folder in the layout of {layouts[0].NAME}, and not this file; to use "
+            "these cameras, move the poses of that layout out of the folder"
+        )
 
 
 def report(found: Found) -> str:

@@ -68,6 +68,7 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
         MediaError: a file cannot be read.
     """
     footage = find_footage(root)
+    _check_distance(root, footage, wishes)
     images = [one.files[0] for one in footage if frame_count(one) == 1]
     if len(images) == len(footage) and wishes.rig == "moving":
         notice(f"{root}: taken for the frames of a camera that moves (as --rig says)")
@@ -79,12 +80,13 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
         notice(f"{root}: taken for photographs of one scene ({counted(len(footage), 'image')}{frames})")
         found = _find_photographs(root, footage)
     else:
+        given = read_clocks(wishes.sync, [one.name for one in footage]) if isinstance(wishes.sync, Path) else None
         surveys = [survey(one) for one in progress(footage, "looking at what moves", unit="camera")]
         moving = [one.name for one, seen in zip(footage, surveys, strict=True) if not seen.is_still]
         is_still = not moving if wishes.rig == "auto" else wishes.rig == "still"
         notice(f"{root}: {_what(footage, surveys, is_still, wishes.rig)}")
         if is_still:
-            found = _find_still_rig(root, footage, surveys, wishes)
+            found = _find_still_rig(root, footage, surveys, given or str(wishes.sync))
         elif len(footage) == 1:
             found = _find_moving_camera(root, footage[0])
         else:
@@ -113,7 +115,26 @@ def _what(footage: Sequence[Footage], surveys: Sequence[Survey], is_still: bool,
     return f"taken for {'a camera that moves' if len(footage) == 1 else 'cameras that move'} ({why})"
 
 
-def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Survey], wishes: Wishes) -> Found:
+def _check_distance(root: Path, footage: Sequence[Footage], wishes: Wishes) -> None:
+    """Refuse a distance between views that are not there, before they are placed."""
+    if wishes.distance is None:
+        return
+    counts = [frame_count(one) for one in footage]
+    is_one = len(footage) == 1 or (wishes.rig == "moving" and max(counts) == 1)
+    names = _frame_names(sum(counts)) if is_one else [one.name for one in footage]
+    unknown = [name for name in wishes.distance[:2] if name not in names]
+    if unknown:
+        is_or_are = agreeing(len(unknown), "is not there", "are not there")
+        raise DatasetError(f"{root}: --distance: {', '.join(unknown)} {is_or_are}; there are {first_names(names)}")
+
+
+def _frame_names(count: int) -> list[str]:
+    """Return the names of the views of a camera that moves."""
+    return [f"{number:06d}" for number in range(count)]
+
+
+def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Survey], sync: str | list[Clock]) -> Found:
+    """Place cameras that stand still; their clocks are given, or found as --sync says."""
     if len(footage) < LEAST_CAMERAS:
         raise DatasetError(
             f"{root}: {counted(len(footage), 'camera')} that {agreeing(len(footage), 'stands', 'stand')} still: depth "
@@ -122,14 +143,14 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
     names = [one.name for one in footage]
     lenses = _lenses([seen.median.shape for seen in surveys])
     still: Structure | None = None
-    if isinstance(wishes.sync, str):
-        clocks = clocks_by_sound(footage, wishes.sync)
-        if wants_motion(footage, clocks, wishes.sync):
+    if isinstance(sync, str):
+        clocks = clocks_by_sound(footage, sync)
+        if wants_motion(footage, clocks, sync):
             still = reconstruct(still_pictures(surveys), names, lenses, ATTEMPTS[0][0])
             clocks = clocks_by_motion(footage, surveys, clocks, still.views)
         _warn_of_clocks(root, names, clocks)
     else:
-        clocks = read_clocks(wishes.sync, names)
+        clocks = sync
     best: Structure | None = None
     for features, instants in ATTEMPTS:
         pictures = [*still_pictures(surveys), *moving_pictures(footage, surveys, clocks, instants)]
@@ -166,7 +187,7 @@ def _warn_of_clocks(root: Path, names: Sequence[str], clocks: Sequence[Clock]) -
 
 def _find_moving_camera(root: Path, footage: Footage) -> Found:
     count = frame_count(footage)
-    names = [f"{number:06d}" for number in range(count)]
+    names = _frame_names(count)
     pictures = (Picture(number, 0, grey.round().astype(np.uint8), None) for number, grey in enumerate(greys(footage)))
     features = FEATURES_OF_LONG if count > LONG else FEATURES_OF_MANY if count > MANY else ATTEMPTS[0][0]
     structure = reconstruct(pictures, names, [0] * count, features, FRAMES)

@@ -14,7 +14,7 @@ from typing import Any
 
 from kpc.encoder.datasets.capture import first_names, printable
 from kpc.encoder.datasets.layouts.documents import MAX_BYTES, read_json
-from kpc.encoder.datasets.layouts.transforms import GREATEST_RATE, LONGEST_OFFSET_S
+from kpc.encoder.datasets.layouts.transforms import check_clock
 from kpc.encoder.poses.clocks import UNKNOWN, Clock
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.text import notice
@@ -51,8 +51,7 @@ def _clock(file: Path, name: str, value: Any) -> Clock:
     if others:
         raise DatasetError(f"{where}: unknown keys {first_names(others)}; there are {' and '.join(KEYS)}")
     offset, rate = (_number(where, key, entry.get(key, default)) for key, default in zip(KEYS, (0.0, 1.0), strict=True))
-    if not (abs(offset) <= LONGEST_OFFSET_S and 1 / GREATEST_RATE <= rate <= GREATEST_RATE):
-        raise DatasetError(f"{where}: offset_s {offset:g} or rate {rate:g} is that of no clock; correct it")
+    check_clock(where, KEYS, offset, rate)
     return Clock(offset, rate, "given", float("nan"))
 
 

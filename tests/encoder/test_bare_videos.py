@@ -1,6 +1,7 @@
 """Cameras of bare videos: what a folder is taken for, structure from motion, the document and reading it back."""
 
 import json
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -105,7 +106,7 @@ def test_the_document_is_read_back_with_its_clocks(room, document, tmp_path):
 @pytest.mark.parametrize(
     "change, said",
     [
-        ({"time_rate": 3.0}, "is that of no clock"),
+        ({"time_rate": 3.0}, r"time_rate 3 is not from 0\.5 to 2;"),
         ({"w": None}, "needs w and h"),
         ({"near": 5.0, "far": 1.0}, "near"),
     ],
@@ -170,6 +171,37 @@ def test_what_cannot_be_matched_is_named(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "0 of 3 cameras could be placed, too few: a (matches none)" in said
     assert not (tmp_path / "transforms.json").exists()
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (["--distance", "a,cam99=1"], "--distance: cam99 is not there; there are a, b, c"),
+        (["--sync", "nosuch.json"], "nosuch.json: no such file"),
+        (["--sync", "offsets.json"], "cam99; there are a, b, c"),
+    ],
+)
+def test_cameras_that_are_not_there_are_refused_before_videos_are_read(tmp_path, monkeypatch, capsys, options, said):
+    for name in ("a", "b", "c"):
+        film(tmp_path / f"{name}.mp4")
+    (tmp_path / "offsets.json").write_text('{"cam99": 1}')
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("kpc.encoder.poses.find.survey", lambda _: pytest.fail("a video was read"))
+    assert kpposes.main([".", *options]) == 1 and said in capsys.readouterr().err
+
+
+def test_footage_that_is_not_there_is_named(tmp_path, capsys):
+    for options in ([], ["-o", str(tmp_path / "x.json")]):
+        assert kpposes.main([str(tmp_path / "nosuch"), *options]) == 2
+        assert "nosuch: no such folder; give a folder of videos" in capsys.readouterr().err
+
+
+def test_it_is_said_if_kpenc_reads_other_poses(walk, tmp_path, capsys):
+    folder = tmp_path / "set"
+    shutil.copytree(walk[0], folder)
+    (folder / "poses_bounds.npy").touch()
+    assert kpposes.main([str(folder)]) == 0
+    assert "kpenc reads the folder in the layout of LLFF, and not this file" in capsys.readouterr().err
 
 
 def test_only_a_document_of_kpposes_is_replaced(tmp_path, capsys):

@@ -134,9 +134,29 @@ def _video_view(where: str, keys: dict[str, Any], video: Path, is_test: bool) ->
     near, far = number_of(where, keys, "near", math.nan), number_of(where, keys, "far", math.nan)
     check_depths(where, near, far)
     offset, rate = number_of(where, keys, "time_offset", 0.0), number_of(where, keys, "time_rate", 1.0)
-    if not (abs(offset) <= LONGEST_OFFSET_S and 1 / GREATEST_RATE <= rate <= GREATEST_RATE):
-        raise DatasetError(f"{where}: time_offset {offset:g} or time_rate {rate:g} is that of no clock; correct it")
+    check_clock(where, ("time_offset", "time_rate"), offset, rate)
     return replace(view, near=near, far=far, clock=(offset, rate))
+
+
+def check_clock(where: str, names: tuple[str, str], offset_s: float, rate: float) -> None:
+    """Refuse an offset or a rate that no clock has.
+
+    Args:
+        where: they stand, for messages.
+        names: of both there.
+        offset_s: in seconds.
+        rate: seconds of the clip for one of the camera.
+
+    Raises:
+        DatasetError: one of them is out of range, or NaN.
+    """
+    longest, least = LONGEST_OFFSET_S, 1 / GREATEST_RATE
+    if not abs(offset_s) <= longest:
+        raise DatasetError(
+            f"{where}: {names[0]} {offset_s:g} is not from -{longest:g} to {longest:g} seconds; correct it"
+        )
+    if not least <= rate <= GREATEST_RATE:
+        raise DatasetError(f"{where}: {names[1]} {rate:g} is not from {least:g} to {GREATEST_RATE:g}; correct it")
 
 
 def report_contradictions(file: Path, document: dict[str, Any], image: Path) -> None:
