@@ -144,6 +144,11 @@ def test_the_page_of_someone_else_stays(tmp_path: Path, capsys: pytest.CaptureFi
     assert [path.name for path in tmp_path.iterdir()] == ["index.html"]
 
 
+def test_a_scene_that_is_not_there_leaves_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert kpshare.main([str(tmp_path / "nosuch.kpc"), "-o", str(tmp_path / "a/site")]) == 1
+    assert "nosuch.kpc: No such file" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [

@@ -50,6 +50,8 @@ def test_records_of_equal_settings_are_compared(tmp_path: Path, capsys: pytest.C
 
 
 def test_what_holds_no_records_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "x.json").write_text("{}")
-    assert main(["compare", str(tmp_path / "x.json"), str(tmp_path / "x.json")]) == 1
-    assert "not records of kpbench" in capsys.readouterr().err
+    wrong = {"{}": "not a list of records", "[{}]": "not records of kpbench (record 1 has no 'settings')"}
+    for text, said in wrong.items():
+        (tmp_path / "x.json").write_text(text)
+        assert main(["compare", str(tmp_path / "x.json"), str(tmp_path / "x.json")]) == 1
+        assert f"x.json: {said}; write it with kpbench --out" in capsys.readouterr().err

@@ -416,6 +416,22 @@ def test_a_job_larger_than_any_worker_is_one_line(threads: Client, tmp_path: Pat
         outcomes(threads, tmp_path, [task(0, resources=Resources(cores=3))])
 
 
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["--scheduler", "foo"], "'foo' is no address of a scheduler, such as tcp://head:8786"),
+        (["--scheduler", "tcp://head:none"], "is no address of a scheduler"),
+        (["--memory", "1"], "'1' is less than any job takes"),
+    ],
+)
+def test_what_no_job_can_run_on_is_refused(
+    take: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    with pytest.raises(SystemExit):
+        main([str(take), "-o", str(tmp_path / "out"), "--dry-run", *words])
+    assert said in capsys.readouterr().err
+
+
 def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine, "CONNECT_S", 0.2)
     with (

@@ -108,7 +108,17 @@ def test_what_cannot_be_shown_is_named(tmp_path: Path, capsys: pytest.CaptureFix
     text = Elements(written(tmp_path, [record("novel", "thing"), broken, {}, encoded([30.0])])).text
     assert "a kind that this page does not know" in text and "novel" in text and "thing" in text
     assert "broken" in text and "not as kpbench writes it: TypeError" in text
-    assert "4 records, 3 of them only named" in capsys.readouterr().out
+    assert "4 records (3 cannot be drawn; the end of the page lists them, and why), " in capsys.readouterr().out
+
+
+def test_a_file_counts_once_and_an_empty_one_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    some, empty, page = (tmp_path / name for name in ("some.json", "empty.json", "page.html"))
+    some.write_text(json.dumps([encoded([30.0])]))
+    empty.write_text("[]")
+    twice = [str(some), str(tmp_path / "." / ".." / tmp_path.name / "some.json")]
+    assert kpbench.main(["report", *twice, str(empty), "-o", str(page)]) == 0
+    said = capsys.readouterr()
+    assert f"{page}: 1 record, " in said.out and said.err == f"kpbench: {empty}: holds no records\n"
 
 
 @pytest.mark.parametrize("content", ["{}", "[1]", "no JSON", "[" * 100_000])

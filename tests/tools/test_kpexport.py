@@ -210,6 +210,7 @@ def test_only_the_box_of_a_contracted_scene_is_exported(run: Run, tmp_path: Path
     ("arguments", "possible"),
     [
         (["scene.kpc", "-o", "points.obj"], ".ply or .glb"),
+        (["points.ply", "-o", "cameras.json"], "points.ply: is by its name neither a scene (.kpc) nor"),
         (["scene.kpc", "-o", ""], "the name is empty"),
         (["scene.kpc", "-o", "points.ply", "--format", "glb"], "contradicts"),
         (["scene.kpc", "-o", "points.ply", "--resolution", "64"], "--mesh"),

@@ -12,6 +12,7 @@ source = "videos/take01"              # beside the file, or an address
 options = { steps = 2000 }
 """
 
+import argparse
 import contextlib
 import io
 import itertools
@@ -36,6 +37,8 @@ A_BATCHS_OWN = "a batch sets this option of kpenc itself; drop it"
 TABLES = {"options", "grid", "resources"}
 SCENE_KEYS = {"source", "name", "options", "resources"}
 ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+# Bytes: PyTorch alone takes more.
+LEAST_MEMORY = 100_000_000
 # Characters of names that are replaced in names of files.
 UNSAFE = re.compile(r"[^\w.+-]+")
 
@@ -189,6 +192,18 @@ def check_results(batch: Batch) -> None:
     faults.check()
 
 
+def memory_size(text: str) -> int:
+    """Parse the memory of a job in bytes, as `cli.byte_count` does; refuse what no job can do with.
+
+    Raises:
+        argparse.ArgumentTypeError: it is no size, or too small.
+    """
+    size = cli.byte_count(text)
+    if size < LEAST_MEMORY:
+        raise argparse.ArgumentTypeError(f"{text!r} is less than any job takes; give 100MB or more, such as 3GB")
+    return size
+
+
 def resolve(text: str, folder: Path) -> str:
     """Return an address unchanged, and a path as an absolute one, relative to a folder."""
     return text if ADDRESS.match(text) else str((folder / text).expanduser().absolute())
@@ -278,8 +293,8 @@ def _resources(given: Mapping[str, Any], number: int, lines: TomlLines, faults: 
     memory = 0
     if "memory" in given:
         try:
-            memory = cli.byte_count(str(given["memory"]))
-        except Exception as error:  # argparse's, which has the words
+            memory = memory_size(str(given["memory"]))
+        except argparse.ArgumentTypeError as error:
             add("memory", f"memory: {error}")
     return Resources(counts["cores"], memory, counts["gpus"])
 

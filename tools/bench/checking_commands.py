@@ -116,7 +116,7 @@ def _beginning(kind: str, options: argparse.Namespace, origin: Record) -> tuple[
         "test_views": options.test_views,
     }
     record = harness.new_record(kind, options.scene, origin, settings)
-    record |= {"dataset_sha256": data_hash(folder), "seed": None, "renderer": "cpu"}
+    record |= {"dataset_data_sha256": data_hash(folder), "seed": None, "renderer": "cpu"}
     print(f"kpbench: {record['name']}, against {settings['dataset']}", file=sys.stderr)
     return record, quality.Job(options.scene, folder, holdout, downscale, options.test_views)
 

@@ -2,7 +2,8 @@
 
 A record is a JSON object. All kinds have the keys `kind`, `name` (dataset or scene), `date`, `commit`, `command`,
 `machine`, `versions`, `load_average`, `data_sha256`, `settings`, `seed`, `renderer` and `repeats`, the list of what
-each run measured; some have more.
+each run measured; some have more. Those that compare a scene with its dataset have `dataset_data_sha256`, which is of
+the dataset what `data_sha256` is of the scene; `dataset_sha256` in the metadata of scenes is another hash.
 """
 
 import json
@@ -38,13 +39,27 @@ def load(paths: Iterable[Path], check: Callable[[Record], object]) -> list[Recor
     """
     records: list[Record] = []
     for path in paths:
-        try:
-            found = json.loads(path.read_text())
-            if not isinstance(found, list):
-                raise ValueError("not a list")
-            for record in found:
+        found = read(path)
+        for number, record in enumerate(found, 1):
+            try:
                 check(record)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise FormatError(f"{path}: not records of kpbench ({error!r}); write it with kpbench --out") from error
+            except (ValueError, KeyError, TypeError, AttributeError) as error:
+                why = f"record {number} has no {error}" if type(error) is KeyError else f"record {number}: {error}"
+                raise FormatError(f"{path}: not records of kpbench ({why}); write it with kpbench --out") from error
         records += found
     return records
+
+
+def read(path: Path) -> list[Record]:
+    """Read a list of objects, records of whatever kind.
+
+    Raises:
+        FormatError: the file holds something else.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path}: not records of kpbench ({error}); write it with kpbench --out") from error
+    if not isinstance(found, list) or not all(isinstance(record, dict) for record in found):
+        raise FormatError(f"{path}: not a list of records; write it with kpbench --out")
+    return found

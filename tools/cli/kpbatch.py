@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
@@ -25,6 +26,7 @@ from kpc.tools.batch.jobs import (
     Resources,
     check_results,
     jobs_of_folders,
+    memory_size,
     read_jobs,
     resolve,
 )
@@ -147,16 +149,31 @@ def _parse(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
     )
     parser.add_argument("-o", "--output", type=cli.file_name, metavar="OUT", help="folder or address of the results")
     parser.add_argument(
-        "--scheduler", metavar="tcp://HOST:PORT", help="a Dask scheduler that runs, in place of workers on this machine"
+        "--scheduler",
+        type=_scheduler,
+        metavar="tcp://HOST:PORT",
+        help="a Dask scheduler that runs, in place of workers on this machine",
     )
     parser.add_argument("--workers", type=_count, help="jobs at once on this machine (default: by cores and memory)")
     parser.add_argument("--cores", type=_count, default=1, help="of each job, for folders (default: %(default)s)")
-    parser.add_argument("--memory", type=cli.byte_count, metavar="3GB", help="of each job, for folders")
+    parser.add_argument("--memory", type=memory_size, metavar="3GB", help="of each job, for folders")
     parser.add_argument("--scratch", type=cli.file_name, metavar="DIR", help="folder of workers for what they work on")
     parser.add_argument("--dry-run", action="store_true", help="only check all jobs, and list what is done")
     parser.add_argument("--json", action="store_true", help="print a line of JSON for each event, and the results")
     split = argv.index("--") if "--" in argv else len(argv)
     return parser.parse_args(argv[:split]), argv[split + 1 :]
+
+
+def _scheduler(text: str) -> str:
+    """Parse the address of a Dask scheduler, which may lack tcp://."""
+    try:
+        parts = urlsplit(text if ADDRESS.match(text) else f"tcp://{text}")
+        is_address = parts.hostname is not None and parts.port is not None
+    except ValueError:
+        is_address = False
+    if not is_address:
+        raise argparse.ArgumentTypeError(f"{text!r} is no address of a scheduler, such as tcp://head:8786")
+    return text
 
 
 def _count(text: str) -> int:

@@ -99,8 +99,8 @@ def _command(argv: list[str]) -> None:
 def _held(folder: Path, files: Sequence[Path], options: argparse.Namespace) -> Iterator[None]:
     """Make a folder and keep runs with other options out of it; remove what was made if it stays empty."""
     made = [path for path in (folder, *folder.parents) if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
     sources = [[str(file.absolute()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+    folder.mkdir(parents=True, exist_ok=True)
     try:
         with claimed(folder, "kpshare", {"sources": sources, "title": options.title, "url": options.url}):
             yield

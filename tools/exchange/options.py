@@ -167,6 +167,11 @@ def _task_of(options: argparse.Namespace) -> Task:
     ):
         return Task("geometry", True, f".{options.format or 'ply'}")
     if suffix not in GEOMETRY_SUFFIXES:
+        if source not in ("", ".kpc"):
+            cameras = ", ".join((".json", *GLTF_SUFFIXES, *USD_SUFFIXES))
+            raise UsageError(
+                f"{options.input}: is by its name neither a scene (.kpc) nor a file of cameras ({cameras}); give one"
+            )
         raise UsageError(
             f"-o {options.output}: {suffix} is not written from a scene; give {' or '.join(GEOMETRY_SUFFIXES)}, "
             f"{' or '.join(CAMERA_SUFFIXES)} for its cameras, or a folder: a name without suffix or with / at its end"

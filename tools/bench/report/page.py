@@ -7,7 +7,6 @@ What is absent, the page says, with the command that makes it; a record that it 
 
 import base64
 import binascii
-import json
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -16,8 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from kpc.format.common import cli
-from kpc.format.common.errors import FormatError, KpcError
+from kpc.format.common.errors import KpcError
+from kpc.format.common.text import counted, notice
 from kpc.tools import pages
+from kpc.tools.bench import records as record_files
 from kpc.tools.bench.columns import COLUMNS, TITLES
 from kpc.tools.bench.records import Record
 from kpc.tools.bench.report.trades import COMMANDS, SECTIONS, AnyChart
@@ -62,14 +63,16 @@ def main(argv: Sequence[str]) -> None:
     )
     options = parser.parse_args(argv)
     cli.check_writable(options.output)
-    found = [one for path in options.records for one in read(path)]
+    files = {path.resolve(): path for path in reversed(options.records)}  # each once
+    found = [one for path in reversed(files.values()) for one in read(path)]
     text = as_page(found)
     if (size := len(text.encode())) > MOST_BYTES:
         raise KpcError(f"the page would take {size / 1e6:.1f} MB, more than {MOST_BYTES / 1e6:g}; give fewer records")
     with cli.atomic_write(options.output) as aside:
         aside.write_text(text, encoding="utf-8")
     left_out = sum(bool(one.fault) for one in found)
-    print(f"{options.output}: {len(found)} records, {left_out} of them only named, {size / 1e6:.1f} MB")
+    note = f" ({left_out} cannot be drawn; the end of the page lists them, and why)" if left_out else ""
+    print(f"{options.output}: {counted(len(found), 'record')}{note}, {size / 1e6:.1f} MB")
 
 
 def read(path: Path) -> list[Found]:
@@ -78,12 +81,9 @@ def read(path: Path) -> list[Found]:
     Raises:
         FormatError: it holds no list of objects.
     """
-    try:
-        records = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{path}: not records of kpbench ({error}); write it with kpbench --out") from error
-    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
-        raise FormatError(f"{path}: not a list of records; write it with kpbench --out")
+    records = record_files.read(path)
+    if not records:
+        notice(f"kpbench: {path}: holds no records")
     return [Found(path.name, record, fault_of(record)) for record in map(_fit, records)]
 
 
