@@ -161,7 +161,6 @@ class Groups:
                 self.reader.source = open_source(source.read_at(0, source.size))
             spans = self._spans()
             self._first = self._opened(0, self._slice(0, self.reader.source))
-        self._beside = None if self.is_single else self._metadata_beside()
         self.timeline = Timeline(spans, self._first.head.clip.fps)
         self._check(0, self._first)
 
@@ -215,8 +214,11 @@ class Groups:
         """Return the metadata beside the groups, which are those of the clip; without any, those of the first group."""
         return self._first.metadata() if self._beside is None else self._beside
 
-    def _metadata_beside(self) -> Metadata | None:
-        """Return the metadata beside the groups; None if there are none, or not yet."""
+    @cached_property
+    def _beside(self) -> Metadata | None:
+        """The metadata beside the groups; None if there are none, or not yet."""
+        if self.is_single:
+            return None
         found = [number for number, entry in enumerate(self.reader.index) if entry.kind == "meta"]
         if len(found) > 1:
             raise FormatError(f"{self.name}: holds {len(found)} meta chunks, not one")

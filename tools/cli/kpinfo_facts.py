@@ -3,7 +3,8 @@
 Shares are in [0, 1], times in seconds, sizes in bytes. What is not known is None.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,12 @@ from kpc.format.common.errors import BudgetError, FormatError, KpcError, UsageEr
 from kpc.format.common.progress import in_parts, progress
 from kpc.format.common.text import counted
 from kpc.format.container.clip_sound import SoundSpan, sound_spans
-from kpc.format.container.container import Codec, Entry
+from kpc.format.container.container import Codec, Entry, Reader
 from kpc.format.container.groups import Groups
 from kpc.format.container.http_address import public_name
 from kpc.format.container.scene_io import SceneReader, read
+from kpc.format.container.scene_layout import GROUP_KIND
+from kpc.format.container.slices import sliced
 from kpc.format.container.sources import open_source
 from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, Clip, HybridDecoder
@@ -61,33 +64,55 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
         "metadata": None,
         "groups": [],
     }
-    try:
+    with _noting(info):
         source = open_source(file, limit=memory)
         info |= {"file": source.name, "size_bytes": source.size}
-        groups = Groups(source, memory_budget=memory, allow_partial=True)
-        if group is not None and not 0 <= group < len(groups):
+        reader = Reader(source, allow_partial=True)
+        info |= {"version": reader.header.version, "expected_bytes": reader.header.file_length}
+        count = sum(entry.kind == GROUP_KIND for entry in reader.index) or 1
+        if group is not None and not 0 <= group < count:
             raise UsageError(
-                f"{groups.name}: there is no group {group}: it has {counted(len(groups), 'group')}, numbered from 0"
+                f"{reader.name}: there is no group {group}: it has {counted(count, 'group')}, numbered from 0"
             )
-        header, clip = groups.reader.header, groups.clip
-        info |= {"version": header.version, "expected_bytes": header.file_length, "clip": _clip(clip)}
-        info["groups"] = [_group(groups, span) for span in sound_spans(groups.timeline)]
-        info["clip"]["is_dynamic"] = any(one["is_dynamic"] for one in info["groups"])
-        info |= {"cameras": len(groups.cameras()), "metadata": dict(groups.metadata().document)}
         if verify:
-            _verify(groups, range(len(groups)) if group is None else [group], info)
-        if (details or not verify) and (group is not None or groups.is_single):
-            reader = groups.open(group or 0)
-            scene = read(reader, memory_budget=memory, allow_partial=True)  # without details, too, to notice damage
-            info["groups"][group or 0]["scene"] = describe(reader, scene) if details else None
+            with _noting(info):
+                _verify(reader, group, memory, info)
+        groups = Groups(source, memory_budget=memory, allow_partial=True)
+        _describe_file(groups, info)
+        if info["error"] is None and (details or not verify) and (group is not None or groups.is_single):
+            scene_reader = groups.open(group or 0)
+            scene = read(
+                scene_reader, memory_budget=memory, allow_partial=True
+            )  # without details, too: it finds damage
+            info["groups"][group or 0]["scene"] = describe(scene_reader, scene) if details else None
+    info["verified"] = verify and info["error"] is None
+    return info
+
+
+@contextmanager
+def _noting(info: dict[str, Any]) -> Iterator[None]:
+    """Keep what goes wrong as the error of a file, unless it has one, and go on."""
+    try:
+        yield
     except UsageError:
         raise
     except (KpcError, OSError) as error:
         message = cli.message_of(error)
         if message is None:
             raise
-        info["error"] = f"{message}; give more with --memory" if isinstance(error, BudgetError) else message
-    return info
+        if info["error"] is None:
+            info["error"] = f"{message}; give more with --memory" if isinstance(error, BudgetError) else message
+
+
+def _describe_file(groups: Groups, info: dict[str, Any]) -> None:
+    """Set what can be read without decoding planes."""
+    info["clip"] = _clip(groups.clip)
+    info["groups"] = [_group(groups, span, info) for span in sound_spans(groups.timeline)]
+    info["clip"]["is_dynamic"] = any(one["is_dynamic"] for one in info["groups"])
+    with _noting(info):
+        info["cameras"] = len(groups.cameras())
+    with _noting(info):
+        info["metadata"] = dict(groups.metadata().document)
 
 
 def totals(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -112,14 +137,21 @@ def _clip(clip: Clip) -> dict[str, Any]:
     return {"frame_count": clip.frame_count, "fps": clip.fps, "duration_s": clip.total_s}
 
 
-def _group(groups: Groups, heard: SoundSpan) -> dict[str, Any]:
-    """Return what header, index and SCNE of a group say; the group of a file without groups is the whole file."""
+def _group(groups: Groups, heard: SoundSpan, info: dict[str, Any]) -> dict[str, Any]:
+    """Return what header, index and SCNE of a group say, as far as they can be read; the first error goes to `info`.
+
+    The group of a file without groups is the whole file.
+    """
     number, clip = heard.group, groups.clip
     span = groups.timeline.spans[number]
     since, until = (time * clip.duration_s for time in groups.timeline.display_span(number))
     if number == len(groups) - 1:
         until = clip.total_s  # The last frame is shown as long as the others.
-    head = groups.open(number).head if groups.available(number) else None
+    head, sound = None, None
+    if groups.available(number):
+        with _noting(info):
+            head = groups.open(number).head
+            sound = _sound(groups.open(number), heard)
     is_complete = head is not None and (not groups.is_single or groups.reader.source.size >= groups.size_bytes[0])
     return {
         "number": number,
@@ -130,7 +162,7 @@ def _group(groups: Groups, heard: SoundSpan) -> dict[str, Any]:
         "value_count": head.value_count if head else None,
         "scale_count": len(head.scales) if head else None,
         "is_dynamic": head.is_dynamic if head else None,
-        "sound": _sound(groups.open(number), heard) if head else None,
+        "sound": sound,
         "scene": None,
     }
 
@@ -147,50 +179,85 @@ def _sound(reader: SceneReader, heard: SoundSpan) -> dict[str, Any] | None:
     return {"channels": first.channels, "duration_s": duration_s, "heard_s": heard_s, "stored_bytes": size}
 
 
-def _verify(groups: Groups, numbers: Sequence[int], info: dict[str, Any]) -> None:
-    """Check the CRC32C of every chunk and decode all chunks of known kinds; set `verified` and `damaged_chunks`.
+def _verify(file: Reader, group: int | None, memory: int, info: dict[str, Any]) -> None:
+    """Check the CRC32C of every chunk and decode all chunks of known kinds; set `damaged_chunks`.
+
+    Args:
+        file: the whole file, of which nothing but header and index need be right.
+        group: the only group to check; None for all.
+        memory: bytes that one group may take.
+        info: of the file.
 
     Raises:
         FormatError: chunks are damaged, or the end of the file is missing.
     """
     if info["size_bytes"] < info["expected_bytes"]:
         raise FormatError(
-            f"{groups.name}: cut off at {info['size_bytes']:,} of {info['expected_bytes']:,} bytes; "
-            "fetch the file again"
+            f"{file.name}: cut off at {info['size_bytes']:,} of {info['expected_bytes']:,} bytes; fetch the file again"
         )
     errors, found = [], info["damaged_chunks"]
-    groups.reader.source.will_read(0, groups.reader.source.size)
-    for number in progress(numbers, "checking", unit="groups"):
-        damaged = _damaged_chunks(groups.open(number))
-        errors += [error for *_, error in damaged]
-        place = None if groups.is_single else number
-        found += [{"group": place, "chunk": chunk, "kind": kind} for chunk, kind, _ in damaged]
-    if not groups.is_single and not found:  # what lies around and between the groups
-        for chunk, entry in enumerate(groups.reader.index):
-            if entry.kind != "GRUP" or entry.group in numbers:
-                try:
-                    groups.reader.stored(chunk)
-                except FormatError as error:
-                    errors.append(error)
-                    found.append({"group": None, "chunk": chunk, "kind": entry.kind})
+    file.source.will_read(0, file.source.size)
+    chunks = [number for number, entry in enumerate(file.index) if entry.kind == GROUP_KIND]
+    if group is not None:
+        chunks = [number for number in chunks if file.index[number].group == group]
+    is_single = all(entry.kind != GROUP_KIND for entry in file.index)
+    for chunk in progress([None] if is_single else chunks, "checking", unit="groups"):
+        place = None if chunk is None else file.index[chunk].group
+        for number, kind, error in _damaged_chunks(file, memory) if chunk is None else _damaged_in(file, chunk, memory):
+            errors.append(error)
+            found.append({"group": None if kind == GROUP_KIND else place, "chunk": number, "kind": kind})
+    if not is_single:
+        beside = [number for number, entry in enumerate(file.index) if entry.kind != GROUP_KIND]
+        for number, kind, error in _differing(file, beside):
+            errors.append(error)
+            found.append({"group": None, "chunk": number, "kind": kind})
     if len(errors) > 1:
         named = [
             f"{one['chunk']} ({one['kind']})" + (f" of group {one['group']}" if one["group"] is not None else "")
             for one in found
         ]
         listed = ", ".join(named[:DAMAGED_SHOWN]) + ", ..." * (len(named) > DAMAGED_SHOWN)
-        raise FormatError(f"{groups.name}: {len(found)} chunks are damaged: {listed}; fetch the file again")
+        raise FormatError(f"{file.name}: {len(found)} chunks are damaged: {listed}; fetch the file again")
     if errors:
         raise errors[0]
-    info["verified"] = True
 
 
-def _damaged_chunks(reader: SceneReader) -> list[tuple[int, str, FormatError]]:
+def _damaged_in(file: Reader, chunk: int, memory: int) -> list[tuple[int, str, FormatError]]:
+    """Return as `_damaged_chunks` does what is damaged in a GRUP chunk, or that chunk if it is damaged elsewhere."""
+    entry = file.index[chunk]
+    try:
+        name = f"{file.name}, group {entry.group}"
+        damaged = _damaged_chunks(Reader(sliced(file.source, entry.offset, entry.stored_length, name)), memory)
+    except FormatError:
+        if found := _differing(file, [chunk]):
+            return found
+        raise
+    return damaged or _differing(file, [chunk])
+
+
+def _differing(file: Reader, numbers: Sequence[int] | None = None) -> list[tuple[int, str, FormatError]]:
+    """Return number, kind and error of each chunk, of all or of these, whose CRC32C differs."""
+    damaged = []
+    for number in in_parts(range(len(file.index)) if numbers is None else numbers):
+        try:
+            file.stored(number)
+        except FormatError as error:
+            damaged.append((number, file.index[number].kind, error))
+    return damaged
+
+
+def _damaged_chunks(file: Reader, memory: int) -> list[tuple[int, str, FormatError]]:
     """Return the number, kind and error of each damaged chunk of a scene.
 
     Raises:
         FormatError: no chunk is damaged, but what they hold is not valid.
     """
+    try:
+        reader = SceneReader(file, memory_budget=memory)
+    except FormatError:
+        if damaged := _differing(file):  # SCNE, without which no plane is decoded
+            return damaged
+        raise
     damaged = []
     for number, entry in in_parts(list(enumerate(reader.index))):
         try:
