@@ -358,7 +358,7 @@ def check_size(scene: Scene | QuantisedScene, trade: Trade, *, is_coded: bool) -
     Raises:
         TrainingError: what coding leaves as it is takes more.
     """
-    trade.check_size(scene.sound, fixed_bytes(scene, with_occupancy=is_coded))
+    trade.check_size(scene.sound, fixed_bytes(scene, with_occupancy=is_coded), is_coded)
 
 
 def load(path: Path) -> Model:

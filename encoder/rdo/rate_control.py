@@ -98,13 +98,14 @@ class Trade:
                 return name, float(value)
         return "max_loss_db", DEFAULT_LOSS_DB
 
-    def check_size(self, sound: Sound | None, fixed: int = 0) -> None:
+    def check_size(self, sound: Sound | None, fixed: int = 0, is_coded: bool = False) -> None:
         """Refuse a size that what is not coded by rate and distortion takes alone, before hours are spent.
 
         Args:
             sound: of the file.
             fixed: bytes that all files of the model have, sound included (`scene_writer.fixed_bytes`); 0 before there
                 is a model.
+            is_coded: whether the sound comes from a .kpc file, where it stays as it is.
 
         Raises:
             TrainingError: they take more.
@@ -114,7 +115,8 @@ class Trade:
         if self.target_bytes is not None and self.target_bytes < least:
             what = "what no quantisation step shrinks (occupancy, cameras, metadata, sound)"
             what = what if fixed == least else "header, index and sound alone"
-            remedy = ", or encode with less sound (--audio-bitrate, --audio none)" if heard else ""
+            less = "; a .kpc file keeps its sound, so encode the dataset" if is_coded else ", or encode"
+            remedy = f"{less} with less sound (--audio-bitrate, --audio none)" if heard else ""
             raise TrainingError(
                 f"--target-size leaves {self.target_bytes:,} bytes for the scene, and {what} "
                 f"take{'s' * (fixed == least)} {least:,}; give a larger size{remedy}"

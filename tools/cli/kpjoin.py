@@ -41,7 +41,8 @@ def _command(argv: list[str]) -> None:
         "--fps",
         type=cli.frame_rate(MIN_FPS, MAX_FPS),
         metavar="F",
-        help="frames per second of the clip; files of other rates keep their length, to half a frame",
+        help="frames per second of the clip; files of other rates are as long as before from the first frame to the "
+        "last, to half a frame, which then lasts 1 / F s",
     )
     options = parser.parse_args(argv)
     if len(options.scenes) < 2:

@@ -31,7 +31,7 @@ def at_speed(scene: QuantisedScene, factor: float) -> QuantisedScene:
 
 
 def at_rate(scene: QuantisedScene, fps: float) -> QuantisedScene:
-    """Return a clip of another frame rate that lasts as long, to half a frame.
+    """Return a clip of another frame rate, as long from its first frame to its last, to half a frame.
 
     Raises:
         UsageError: a moving scene would have a single frame, or a clip more than a file may have.
