@@ -214,7 +214,9 @@ def test_a_size_that_sound_alone_takes_is_refused_at_once() -> None:
     for target, heard, words in ((5000, sound, "give a larger size, or encode with less sound"), (5, None, "larger")):
         with pytest.raises(TrainingError, match=f"leaves {target:,} bytes .* index and sound alone take .*{words}"):
             Trade(target_bytes=target).check_size(heard)
-    with pytest.raises(TrainingError, match="give a larger size; a [.]kpc file keeps its sound, so encode the dataset"):
+    with pytest.raises(
+        TrainingError, match=r"give a larger size; a [.]kpc file keeps its sound, so encode the dataset"
+    ):
         Trade(target_bytes=5000).check_size(sound, is_coded=True)
 
 
