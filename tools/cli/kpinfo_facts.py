@@ -238,7 +238,7 @@ def _damaged_in(file: Reader, chunk: int, memory: int) -> list[tuple[int, str, F
 def _differing(file: Reader, numbers: Sequence[int] | None = None) -> list[tuple[int, str, FormatError]]:
     """Return number, kind and error of each chunk, of all or of these, whose CRC32C differs."""
     damaged = []
-    for number in in_parts(range(len(file.index)) if numbers is None else numbers):
+    for number in range(len(file.index)) if numbers is None else numbers:
         try:
             file.stored(number)
         except FormatError as error:
