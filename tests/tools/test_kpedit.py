@@ -208,7 +208,7 @@ def test_the_input_is_not_overwritten_and_two_cameras_give_no_limits(folder, cap
 
 def test_what_changes_nothing_is_said_or_refused(folder, tmp_path, capsys):
     turns = ["--turn", "x:90", "--turn", "x:-90", "--scale", "1", "--move", "0,0,0"]
-    for words in ([], ["--speed", "1", "--from", "0", "--to", "1.1"], ["--fps", "10", *turns]):
+    for words in ([], ["--speed", "1", "--to", "1.1"], ["--fps", "10", *turns], ["--from", "0.01", "--to", "0.99"]):
         copy = edit(folder, *words)
         assert "there is nothing to change" in capsys.readouterr().err
         assert copy.read_bytes() == (folder / "scene.kpc").read_bytes()

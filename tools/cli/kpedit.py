@@ -63,19 +63,27 @@ def _command(argv: list[str]) -> None:
         raise UsageError("--fps, --speed: the scene is static; it has no frames to show at another rate")
     if edits.speed is not None and has_sound(groups):
         notice("kpedit: the sound is left out, since it belongs to the speed of the source")
-    metadata = _edited_metadata(groups.metadata(), options, edits.placement)
-    if not edits.any:
-        if metadata.document == groups.metadata().document:
-            notice("kpedit: there is nothing to change; the output is a copy of the source")
-        size, kept_s = save(with_metadata(options.scene, metadata), options.output), None
-    else:
-        size, kept_s = edit(options.scene, options.output, edits, metadata)
+    size, kept_s = _write(options, groups, edits)
+    if kept_s == (0.0, groups.clip.duration_s):
+        notice("kpedit: --from, --to: widened to where the clip can be cut, it is kept as a whole")
+        options.start = options.end = None
+        size, kept_s = _write(options, groups, replace(edits, part_s=None))
     is_part = kept_s is not None or options.box is not None
     if is_part and size > options.scene.stat().st_size and _plane_bytes(Groups(options.output)) > _plane_bytes(groups):
         notice(
             "kpedit: larger than the source, since texels are predicted from less; kpenc makes it smaller, at a loss"
         )
     print(escaped(f"{options.output}: {size:,} bytes{_changed_time(options, kept_s)}"))
+
+
+def _write(options: argparse.Namespace, groups: Groups, edits: Edits) -> tuple[int, tuple[float, float] | None]:
+    """Write the edited file; return as `edit` does its size and which part is kept."""
+    metadata = _edited_metadata(groups.metadata(), options, edits.placement)
+    if edits.any:
+        return edit(options.scene, options.output, edits, metadata)
+    if metadata.document == groups.metadata().document:
+        notice("kpedit: there is nothing to change; the output is a copy of the source")
+    return save(with_metadata(options.scene, metadata), options.output), None
 
 
 def _parser() -> argparse.ArgumentParser:
