@@ -127,6 +127,8 @@ class Groups:
         source: as for `Reader`.
         memory_budget: bytes that one group may take.
         allow_partial, in_parts: as for `SceneReader`.
+        reads_metadata: whether metadata beside the groups are read, and refused if they are wrong, at once rather than
+            when they are asked for.
 
     Attributes:
         timeline: which group is shown when.
@@ -144,6 +146,7 @@ class Groups:
         memory_budget: int = DEFAULT_BUDGET,
         allow_partial: bool = False,
         in_parts: bool = False,
+        reads_metadata: bool = True,
     ) -> None:
         source = open_source(source, limit=memory_budget)
         self.reader = Reader(source, allow_partial=allow_partial)
@@ -161,6 +164,8 @@ class Groups:
                 self.reader.source = open_source(source.read_at(0, source.size))
             spans = self._spans()
             self._first = self._opened(0, self._slice(0, self.reader.source))
+        if reads_metadata:
+            _ = self._beside
         self.timeline = Timeline(spans, self._first.head.clip.fps)
         self._check(0, self._first)
 

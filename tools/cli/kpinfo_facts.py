@@ -77,7 +77,7 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
         if verify:
             with _noting(info):
                 _verify(reader, group, memory, info)
-        groups = Groups(source, memory_budget=memory, allow_partial=True)
+        groups = Groups(source, memory_budget=memory, allow_partial=True, reads_metadata=False)
         _describe_file(groups, info)
         if info["error"] is None and (details or not verify) and (group is not None or groups.is_single):
             scene_reader = groups.open(group or 0)
