@@ -105,7 +105,7 @@ class Trade:
             sound: of the file.
             fixed: bytes that all files of the model have, sound included (`scene_writer.fixed_bytes`); 0 before there
                 is a model.
-            is_coded: whether the sound comes from a .kpc file, where it stays as it is.
+            is_coded: whether the sound comes from a .kpc file, which keeps it.
 
         Raises:
             TrainingError: they take more.

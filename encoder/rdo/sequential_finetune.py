@@ -54,14 +54,21 @@ def scales_by_resolution(scene: Scene) -> list[list[int]]:
     """
     found: list[list[int]] = []
     for s in range(len(scene.scales)):
-        follows_still = found and _stands_still(scene, found[-1][-1]) and not _stands_still(scene, s)
-        found = [*found[:-1], [*found[-1], s]] if follows_still else [*found, [s]]
+        if found and _stands_still(scene, found[-1][-1]) and not _stands_still(scene, s):
+            found[-1].append(s)
+        else:
+            found.append([s])
     return found
 
 
 def _stands_still(scene: Scene, s: int) -> bool:
     """Return whether the time planes of a scale are the identity; False in scenes that have none."""
-    return scene.is_dynamic and all((scene.scales[s][name] == 1).all() for name in TIME_PLANES)
+    return scene.is_dynamic and all(_is_identity(scene, s, name) for name in TIME_PLANES)
+
+
+def _is_identity(scene: Scene, s: int, name: str) -> bool:
+    """Return whether a plane is a time plane that changes nothing."""
+    return name in TIME_PLANES and bool((scene.scales[s][name] == 1).all())
 
 
 def step_factors(scene: Scene) -> dict[PlaneKey, float]:
@@ -152,7 +159,7 @@ def _finetune(
     fixed = [
         slice(start, start + rows * columns * M)
         for s, name, start, rows, columns in field.layout.planes()
-        if (s, name) in settled or (name in TIME_PLANES and (scene.scales[s][name] == 1).all())
+        if (s, name) in settled or _is_identity(scene, s, name)
     ]
     before = [theta[part].copy() for part in fixed]
     drawn = ValidationRays.through_occupied(scene, RAYS * steps, seed=100 + seed)

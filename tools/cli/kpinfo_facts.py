@@ -81,9 +81,8 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
         _describe_file(groups, info)
         if info["error"] is None and (details or not verify) and (group is not None or groups.is_single):
             scene_reader = groups.open(group or 0)
-            scene = read(
-                scene_reader, memory_budget=memory, allow_partial=True
-            )  # without details, too: it finds damage
+            # Without details, too: it finds damage.
+            scene = read(scene_reader, memory_budget=memory, allow_partial=True)
             info["groups"][group or 0]["scene"] = describe(scene_reader, scene) if details else None
     info["verified"] = verify and info["error"] is None
     return info
@@ -198,9 +197,9 @@ def _verify(file: Reader, group: int | None, memory: int, info: dict[str, Any]) 
     errors, found = [], info["damaged_chunks"]
     file.source.will_read(0, file.source.size)
     chunks = [number for number, entry in enumerate(file.index) if entry.kind == GROUP_KIND]
+    is_single = not chunks
     if group is not None:
         chunks = [number for number in chunks if file.index[number].group == group]
-    is_single = all(entry.kind != GROUP_KIND for entry in file.index)
     for chunk in progress([None] if is_single else chunks, "checking", unit="groups"):
         place = None if chunk is None else file.index[chunk].group
         for number, kind, error in _damaged_chunks(file, memory) if chunk is None else _damaged_in(file, chunk, memory):

@@ -131,7 +131,7 @@ def _identity(value: Any) -> Any:
 
 
 def _shown(value: Any) -> str:
-    """Return a value as it is given on the command line: a size as 640x480, a colour as #ffffff."""
+    """Return a value as the command line takes it: a size as 640x480, a colour as #ffffff."""
     if isinstance(value, list):
         return "#" + "".join(f"{round(255 * part):02x}" for part in value)
     return "not given" if value is None else re.sub(r"\((\d+), (\d+)\)", r"\1x\2", str(value))
