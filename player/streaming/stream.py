@@ -21,6 +21,7 @@ from kpc.format.coding.quantise import dequantise_symbols
 from kpc.format.common.compiling import MONITOR, NOTICE
 from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, KpcError
 from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.common.text import byte_text
 from kpc.format.container.container import Reader
 from kpc.format.container.partial import PartialScene, adjacent_runs, announce
 from kpc.format.container.scene_io import SceneReader
@@ -39,6 +40,8 @@ RESUME_S = 0.5
 # Bytes that the sound of a clip takes while it is played (`kpc.player.sound.playback`): what is decoded ahead, and
 # packets.
 SOUND_BYTES = 1 << 23
+# Bytes that a scene without its planes may take before it is refused, however small --memory is.
+LEAST_BUDGET = 1 << 25
 # Seconds over which the rate of arriving bytes is averaged.
 RATE_OVER_S = 1.0
 
@@ -90,18 +93,21 @@ class Stream:
         arrived: Callable[[], None] = lambda: None,
         share: float = 1.0,
     ) -> None:
-        self._reader = SceneReader(source, memory_budget=memory, in_parts=True)
+        budget = max(memory, LEAST_BUDGET)  # so that a smaller --memory is refused below, with the one that would do
+        try:
+            self._reader = SceneReader(source, memory_budget=budget, in_parts=True)
+            self.parts = PartialScene(self._reader)
+        except BudgetError as error:
+            raise BudgetError(f"{error}; give more than {memory_option(budget / share)}") from error
         self.source: Source = self._reader.source
         self.memory, self.arrived, self.version = memory, arrived, 0
-        self.parts = PartialScene(self._reader)
         self.scene: Scene = self.parts.scene
         self._layout = Layout.of(self.scene)
         fixed, least = self.fixed_bytes, min_segment_bytes(self.parts)
         if fixed + least > memory:
             needed = math.ceil((fixed + least) / share / 1e6)
             raise BudgetError(
-                f"{self.source.name}: playing takes more than --memory {memory / share / 1e6:.4g}MB; give "
-                f"--memory {needed}MB"
+                f"{self.source.name}: playing takes more than {memory_option(memory / share)}; give --memory {needed}MB"
             )
         self._segment_memory = memory - fixed
         self._stored = np.array([self.parts.entry(number).stored_length for number in self.parts.numbers])
@@ -383,3 +389,8 @@ class Stream:
 def loading_message(bytes_per_s: float) -> str:
     """Return the message for a user who has to wait; no rate where all has arrived and is being decoded."""
     return f"loading, {bytes_per_s / 1e3:,.0f} KB/s" if bytes_per_s >= 500 else "loading"
+
+
+def memory_option(count: float) -> str:
+    """Return the option of kpplay that grants a number of bytes: "--memory 30KB"."""
+    return "--memory " + byte_text(int(count)).removesuffix(" bytes").replace(" ", "")

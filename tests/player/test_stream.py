@@ -167,6 +167,9 @@ def test_too_little_memory_is_reported_before_a_plane_is_fetched() -> None:
     Stream(open_source(data), memory=needed).close()
     with pytest.raises(BudgetError, match="than --memory 6MB; give --memory") as refusal:  # of two groups, one
         Stream(open_source(data), memory=3_000_000, share=0.5)
+    with pytest.raises(BudgetError, match="than --memory 30KB; give --memory 1") as far_too_little:
+        Stream(open_source(data), memory=15_000, share=0.5)
+    assert str(far_too_little.value).rsplit(" ", 1)[1] == str(refusal.value).rsplit(" ", 1)[1]
     assert 2 * needed - 10**6 <= int(str(refusal.value).rsplit(" ", 1)[1].removesuffix("MB")) * 10**6 <= 2 * needed
     assert "fetching" not in [thread.name for thread in threading.enumerate()]
 
