@@ -29,6 +29,7 @@ from kpc.tools.batch.jobs import FaultyBatch, Job, Resources
 from kpc.tools.batch.store import RESULT, SCENE, WORK, Store, StoreError
 from kpc.tools.batch.tasks import ENCODE, Outcome, Task, done_before, first_tasks, tasks_of_groups
 from kpc.tools.batch.working import Place
+from kpc.tools.cli import kpbatch
 from kpc.tools.cli.kpbatch import main
 
 SAMPLE = Path(__file__).parent.parent.parent / "samples" / "default.kpc"
@@ -181,6 +182,24 @@ def test_all_faults_are_found_at_once(tmp_path: Path, take: Path) -> None:
     assert len(error.value.faults) == 3
 
 
+def test_faults_stand_in_the_order_of_the_file_with_all_of_a_scene_whose_source_is_missing(
+    tmp_path: Path, take: Path
+) -> None:
+    shutil.copyfile(SAMPLE, tmp_path / "b.kpc")
+    text = (
+        '[[scene]]\nsource = "take"\nzebra = 1\nalpha = 2\n[[scene]]\nsource = "no"\nname = "a b"\n'
+        'options = { seed = "x" }\nresources = { cores = 0 }\n[[scene]]\nname = "named"\n'
+        '[[scene]]\nsource = "b.kpc"\noptions = { quality = 0 }\n[options]\npreset = "quick"\n[more]\n'
+    )
+    with pytest.raises(FaultyBatch) as error:
+        jobs.read_jobs(write(tmp_path, text), str(tmp_path))
+    said = [fault.removeprefix(f"{tmp_path}/jobs.toml:").split(": ", 1) for fault in error.value.faults]
+    assert [int(line) for line, _ in said] == [3, 4, 6, 7, 8, 9, 10, 12, 14, 16, 17]
+    words = (*("zebra", "alpha", "no such file", "name = 'a b'", "--seed", "cores = 0", "no source"),)
+    words += ("is the source, too", "--quality", "--preset", "'more' is not known")
+    assert all(word in fault for word, (_, fault) in zip(words, said, strict=True))
+
+
 def test_each_fault_of_an_option_stands_in_its_line(tmp_path: Path, take: Path) -> None:
     """Though the parser of options names only the first, and a grid makes many jobs of it."""
     options = '[options]\npresett = "fast"\nsteps = -4\nquality = 900\n[resources]\ncores = "two"\nram = 1\n'
@@ -252,6 +271,23 @@ def test_files_that_cannot_be_coded_are_refused_before_anything_starts(
     assert "nor a .kpc file" in said[0] and "cut off at" in said[1] and "is a pipe" in said[2]
     assert said[1].count("cut.kpc") == 1
     assert main([names[2], "-o", str(tmp_path / "out"), "--dry-run"]) == 0 and not (tmp_path / "out").exists()
+
+
+def test_a_dry_run_names_each_damaged_file_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Though a grid makes two jobs of it; encoding begins without reading files as a whole."""
+    data = bytearray(SAMPLE.read_bytes())
+    data[20_000] ^= 1
+    (tmp_path / "broken.kpc").write_bytes(data)
+    text = '[grid]\nquality = [20, 30]\n[[scene]]\nsource = "none"\n[[scene]]\nsource = "broken.kpc"\n'
+    file = write(tmp_path, text)
+    for words in [str(file)], [str(tmp_path / "none"), str(tmp_path / "broken.kpc")]:
+        assert main([*words, "-o", str(tmp_path / "out"), "--dry-run"]) == 2
+        missing, damaged = capsys.readouterr().err.splitlines()
+        assert "no such file" in missing and "chunk 11 (PLNE) is damaged" in damaged and "damaged" not in missing
+    assert damaged.startswith(f"kpbatch: {tmp_path / 'broken.kpc'}: chunk") and not (tmp_path / "out").exists()
+    with pytest.raises(FaultyBatch) as error:
+        jobs.read_jobs(file, str(tmp_path / "out"))
+    assert len(error.value.faults) == 1
 
 
 def test_a_plan_as_json_is_a_line_for_each_job_and_a_sum(
@@ -439,6 +475,30 @@ def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPat
         engine.remote_cluster("tcp://127.0.0.1:9"),
     ):
         pass
+
+
+def test_a_dry_run_says_whether_the_scheduler_answers(
+    threads: Client, take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    address = threads.scheduler.address
+    kpbatch._try_scheduler(address, [Job("a", "s3://place/a")])
+    assert capsys.readouterr().err == f"kpbatch: {address}: the scheduler answers, and has 2 workers\n"
+    with pytest.raises(engine.ClusterError, match='--resources "cores=3"'):
+        kpbatch._try_scheduler(address, [Job("a", "s3://place/a", resources=Resources(cores=3))])
+    monkeypatch.setattr(engine, "TRY_S", 0.2)
+    assert main([str(take), "-o", str(tmp_path / "out"), "--dry-run", "--scheduler", "127.0.0.1:9"]) == 1
+    said = capsys.readouterr()
+    assert "to do take" in said.out and said.err.count("\n") == 1
+    assert said.err.startswith("kpbatch: 127.0.0.1:9: no Dask scheduler answers")
+
+
+def test_a_server_that_is_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def client(*_: object, **__: object) -> None:
+        raise MemoryError("Unable to allocate 3.07 EiB")  # the first bytes of HTTP/1.1 are a size for Dask
+
+    monkeypatch.setattr(engine, "Client", client)
+    with pytest.raises(engine.ClusterError, match="no Dask scheduler answers"):
+        engine.count_workers("tcp://127.0.0.1:80", [])
 
 
 def in_steps(task: Task, place: Place, report: Report) -> Outcome:

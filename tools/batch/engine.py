@@ -30,6 +30,7 @@ KILLED_WORKERS = 5
 # Memory that a task takes if its job does not say: kpenc on a clip of 300 frames.
 USUAL_MEMORY = 2 << 30
 CONNECT_S = 15
+TRY_S = 5  # in a dry run
 LISTEN_S = 0.5
 # Seconds for which the resources of workers are not asked for again.
 HELD_S = 1.0
@@ -105,15 +106,15 @@ def _without_ctrl_c() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def remote_cluster(address: str) -> Iterator[Client]:
-    """Yield the client of a scheduler that runs.
+def remote_cluster(address: str, timeout_s: float | None = None) -> Iterator[Client]:
+    """Yield the client of a scheduler that runs; it must answer within `timeout_s`, CONNECT_S for None.
 
     Raises:
         ClusterError: there is none.
     """
     try:
-        client = Client(address, timeout=CONNECT_S)
-    except (OSError, ValueError) as error:
+        client = Client(address, timeout=CONNECT_S if timeout_s is None else timeout_s)
+    except Exception as error:  # of any kind, if something else than Dask answers
         raise ClusterError(f"{address}: no Dask scheduler answers; start one with dask scheduler") from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is in our own errors
     with client:
@@ -274,6 +275,19 @@ class Engine:
     def _ended(self, outcome: Outcome) -> Outcome:
         self._outcomes[outcome.key] = outcome
         return outcome
+
+
+def count_workers(address: str, wanted: Sequence[Resources]) -> int:
+    """Return how many workers a scheduler has.
+
+    Raises:
+        ClusterError: it does not answer within TRY_S, or no worker has some of the wanted resources.
+    """
+    with remote_cluster(address, TRY_S) as client:
+        engine = Engine(lambda: client, Place(""))
+        for resources in wanted:
+            engine._resources(resources)
+        return len(engine._held())
 
 
 def _work(runner: Runner, task: Task, place: Place) -> Outcome:

@@ -18,13 +18,14 @@ import io
 import itertools
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
+from kpc.format.container.groups import check_checksums
 from kpc.tools.batch.toml_lines import TomlLines
 
 if TYPE_CHECKING:
@@ -96,41 +97,64 @@ class FaultyBatch(UsageError):
 
 
 class Faults:
-    """Collects what is wrong with a batch, one line for each fault."""
+    """Collects what is wrong with a batch, one line for each fault.
 
-    def __init__(self) -> None:
-        self.lines: dict[str, None] = {}
+    Args:
+        reads_files: whether .kpc files are to be read as a whole, and each is to be checked by its checksums.
+    """
+
+    def __init__(self, reads_files: bool = False) -> None:
+        self._lines: dict[str, None] = {}
+        self._reads_files, self._read = reads_files, set[str]()
 
     def add(self, where: str, text: str) -> None:
-        self.lines[f"{where}: {text}"] = None
+        self._lines[f"{where}: {text}"] = None
 
-    def check(self) -> None:
-        """Raise FaultyBatch if there are faults."""
-        if self.lines:
-            raise FaultyBatch(list(self.lines))
+    def must_read(self, source: str) -> bool:
+        """Return whether a file is still to be read as a whole, which it is once."""
+        if not self._reads_files or source in self._read:
+            return False
+        self._read.add(source)
+        return True
+
+    def check(self, file: Path | None = None) -> None:
+        """Raise FaultyBatch if there are faults, in the order in which they were added.
+
+        Args:
+            file: in whose lines they stand, by which they are sorted.
+        """
+        if self._lines:
+            start = f"{file}:"
+            raise FaultyBatch(
+                list(self._lines)
+                if file is None
+                else sorted(self._lines, key=lambda line: int(line.removeprefix(start).partition(":")[0]))
+            )
 
 
-def read_jobs(path: Path, place: str | None = None) -> Batch:
+def read_jobs(path: Path, place: str | None = None, *, reads_files: bool = False) -> Batch:
     """Read a batch from a TOML file.
 
     Args:
         path: of the file.
         place: folder or address that the results go to in place of the file's own.
+        reads_files: whether the checksums of .kpc files are checked, for which they are read as a whole.
 
     Raises:
         UsageError: it cannot be read.
-        FaultyBatch: something in it is wrong.
+        FaultyBatch: something in it is wrong, or a result would replace a source.
     """
     try:
         text = path.read_text(encoding="utf-8")
         document = tomllib.loads(text)
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
-    lines, faults = TomlLines(path, text), Faults()
-    for key in document.keys() - TABLES - {"output", "scene"}:
+    lines, faults = TomlLines(path, text), Faults(reads_files)
+    for key in _unknown(document, TABLES | {"output", "scene"}):
         faults.add(lines.of(key), f"{key!r} is not known; known are output, scene, {', '.join(sorted(TABLES))}")
     output = document.get("output", place)
-    if not isinstance(output, str) or not output:
+    has_output = isinstance(output, str) and bool(output)
+    if not has_output:
         faults.add(lines.of("output"), 'output names the folder of the results; write for example output = "out"')
     scenes = document.get("scene", [])
     if not isinstance(scenes, list) or not scenes or not all(isinstance(scene, dict) for scene in scenes):
@@ -148,23 +172,27 @@ def read_jobs(path: Path, place: str | None = None) -> Batch:
     for number, scene in enumerate(scenes):
         jobs += _jobs_of(scene, number, common, path.parent, lines, faults)
     _check_names(jobs, "give the scene another name", faults)
-    faults.check()
-    return Batch(tuple(jobs), resolve(str(output), path.parent) if place is None else resolve(place, Path()))
+    batch = Batch(tuple(jobs), resolve(str(output), path.parent) if place is None else resolve(place, Path()))
+    if has_output:
+        _check_results(batch, faults)
+    faults.check(path)
+    return batch
 
 
-def jobs_of_folders(folders: Sequence[str], options: Sequence[str], resources: Resources) -> tuple[Job, ...]:
+def jobs_of_folders(
+    folders: Sequence[str], options: Sequence[str], resources: Resources, *, reads_files: bool = False
+) -> tuple[Job, ...]:
     """Return a job for each folder, file or address, all with the same options of kpenc.
 
     Raises:
-        FaultyBatch: an option is wrong or a source is missing.
+        FaultyBatch: an option is wrong, or a source is missing; or a .kpc file is damaged, if `reads_files`.
     """
-    faults, here = Faults(), Path()
+    faults, here = Faults(reads_files), Path()
     jobs = []
     for folder in folders:
         source = resolve(folder, here)
-        if not ADDRESS.match(source) and not Path(source).exists():
+        if _is_missing(source):
             faults.add(folder, "no such file or folder")
-            continue
         job = Job(name_of(source), source, tuple(options), resources=resources, where=folder)
         jobs.append(_checked(job, faults))
     _check_names(jobs, "name them in a file of jobs, or give them to two commands with a folder -o each", faults)
@@ -178,7 +206,13 @@ def check_results(batch: Batch) -> None:
     Raises:
         FaultyBatch: they would.
     """
-    faults, sources = Faults(), [job.source for job in batch.jobs]
+    faults = Faults()
+    _check_results(batch, faults)
+    faults.check()
+
+
+def _check_results(batch: Batch, faults: Faults) -> None:
+    sources = [job.source for job in batch.jobs]
     paths = [Path(source) for source in sources if not ADDRESS.match(source)]
     for job in batch.jobs:
         result = f"{batch.output.rstrip('/')}/{job.name}.kpc"
@@ -189,7 +223,6 @@ def check_results(batch: Batch) -> None:
                 raise UsageError(f"{result}: is the source, too; write elsewhere with -o")
         except UsageError as error:
             faults.add(job.where, str(error))
-    faults.check()
 
 
 def memory_size(text: str) -> int:
@@ -228,22 +261,9 @@ def _jobs_of(
 ) -> Iterator[Job]:
     """Yield the jobs of one [[scene]]: one for each point of the grid."""
     where = lines.of("scene", number)
-    for key in scene.keys() - SCENE_KEYS:
+    for key in _unknown(scene, SCENE_KEYS):
         faults.add(lines.of(key, number), f"{key!r} is not known; a scene has {', '.join(sorted(SCENE_KEYS))}")
-    source = scene.get("source")
-    if not isinstance(source, str) or not source:
-        faults.add(where, 'the scene has no source; write for example source = "videos/take01"')
-        return
-    source = resolve(source, folder)
-    if not ADDRESS.match(source) and not Path(source).exists():
-        faults.add(lines.of("source", number), f"{source}: no such file or folder")
-        return
-    name = scene.get("name", name_of(source))
-    unsafe = UNSAFE.search(name) if isinstance(name, str) else None
-    if not isinstance(name, str) or not name or unsafe:
-        found = f"{unsafe.group()!r} cannot be in a name, " if unsafe else ""
-        faults.add(lines.of("name", number), f"name = {name!r}: {found}which has letters, digits, and . _ + - only")
-        return
+    source, name = _source_and_name(scene, number, folder, lines, faults)
     own = _table(scene, "options", where, faults)
     taken = common["resources"] | _table(scene, "resources", where, faults)
     resources = _resources(taken, number, lines, faults)
@@ -251,9 +271,41 @@ def _jobs_of(
     for point in itertools.product(*grid.values()):
         chosen = dict(zip(grid, point, strict=True))
         options = common["options"] | chosen | own
-        parts = [name, *(f"{key}-{UNSAFE.sub('_', str(value))}" for key, value in chosen.items())]
+        parts = [name or "", *(f"{key}-{UNSAFE.sub('_', str(value))}" for key, value in chosen.items())]
         words = _words(options, number, lines, faults)
-        yield _checked(Job(".".join(parts), source, tuple(words), resources=resources, where=where), faults, words)
+        job = Job(".".join(parts), source or "", tuple(words), resources=resources, where=where)
+        checked = _checked(job, faults, words)
+        if source is not None and name is not None:
+            yield checked
+
+
+def _source_and_name(
+    scene: dict[str, Any], number: int, folder: Path, lines: TomlLines, faults: Faults
+) -> tuple[str | None, str | None]:
+    """Return the source of a scene and the name of its result, each None if it is wrong."""
+    source: str | None = scene.get("source")
+    if isinstance(source, str) and source:
+        source = resolve(source, folder)
+        if _is_missing(source):
+            faults.add(lines.of("source", number), f"{source}: no such file or folder")
+    else:
+        faults.add(lines.of("scene", number), 'the scene has no source; write for example source = "videos/take01"')
+        source = None
+    name = scene.get("name", name_of(source or "scene"))
+    unsafe = UNSAFE.search(name) if isinstance(name, str) else None
+    if isinstance(name, str) and name and not unsafe:
+        return source, name
+    found = f"{unsafe.group()!r} cannot be in a name, " if unsafe else ""
+    faults.add(lines.of("name", number), f"name = {name!r}: {found}which has letters, digits, and . _ + - only")
+    return source, None
+
+
+def _is_missing(source: str) -> bool:
+    return not ADDRESS.match(source) and not Path(source).exists()
+
+
+def _unknown(table: Mapping[str, Any], known: Collection[str]) -> list[str]:
+    return [key for key in table if key not in known]
 
 
 def _words(options: Mapping[str, Any], number: int, lines: TomlLines, faults: Faults) -> dict[str, str]:
@@ -281,7 +333,7 @@ def _resources(given: Mapping[str, Any], number: int, lines: TomlLines, faults: 
     def add(key: str, text: str) -> None:
         faults.add(lines.of(key, number, ("resources",)), text)
 
-    for key in given.keys() - {"cores", "memory", "gpus"}:
+    for key in _unknown(given, ("cores", "memory", "gpus")):
         add(key, f"{key!r} is not a resource; known are cores, memory and gpus")
     counts = {}
     for key, least in ("cores", 1), ("gpus", 0):
@@ -302,40 +354,49 @@ def _resources(given: Mapping[str, Any], number: int, lines: TomlLines, faults: 
 def _checked(job: Job, faults: Faults, places: Mapping[str, str] | None = None) -> Job:
     """Check a job as a whole, before anything starts.
 
-    Its options are checked by kpenc's own parser. A source on this machine must be a folder that holds something to
-    encode, or a file that begins and ends as those that are coded anew.
+    Its options are checked by kpenc's own parser, and its source by `_check_source`.
 
     Args:
-        job: to be checked.
+        job: to be checked; its source is empty, or not there, if that is reported already.
         faults: gets what is wrong.
         places: the job's options, and the file and line of each; None if they stand where the job does.
 
     Returns:
         The job with what the options say about groups.
     """
+    is_here = bool(job.source) and not ADDRESS.match(job.source) and Path(job.source).exists()
+    if ADDRESS.match(job.source) and job.source.endswith(".kpc"):
+        return job  # its options are checked once the file is there
+    source, places = job.source if is_here else "folder", places or {}
+    plain, unusable = _parsed(source, [])
+    if plain is None:  # whatever the options are
+        for fault in unusable:
+            faults.add(job.where, fault.removeprefix(f"{job.source}: "))
+        source, is_here = "folder", False
+    options, wrong = _parsed(source, job.options)
+    # The parser names only the first option that it refuses; some are refused only beside others.
+    alone = [(place, fault) for word, place in places.items() for fault in _parsed(source, [word])[1]] if wrong else []
+    for place, fault in alone or [(_place_of(fault, places) or job.where, fault) for fault in wrong]:
+        faults.add(place, fault)
+    if is_here and (given := options or plain) is not None:
+        _check_source(job, given, faults)
+    return job if options is None else replace(job, group=options.group_s is not None)
+
+
+def _check_source(job: Job, options: "Options", faults: Faults) -> None:
+    """Check a source on this machine, which must be a folder that holds something to encode, or a file that begins and
+    ends as those that are coded anew; and whose checksums are right, if `faults` says that it must be read.
+    """
     from kpc.encoder.cli.read_dataset import check_folder  # loads PyTorch, which workers need not
     from kpc.encoder.cli.transcode import open_source
 
-    if ADDRESS.match(job.source) and job.source.endswith(".kpc"):
-        return job  # its options are checked once the file is there
-    source, places = "folder" if ADDRESS.match(job.source) else job.source, places or {}
     try:
-        options, wrong = _parsed(source, job.options)
-        # The parser names only the first option that it refuses; some are refused only beside others.
-        alone = (
-            [(place, fault) for word, place in places.items() for fault in _parsed(source, [word])[1]] if wrong else []
-        )
-        for place, fault in alone or [(_place_of(fault, places) or job.where, fault) for fault in wrong]:
-            faults.add(place, fault)
-        if options is None:
-            return job
-        if not ADDRESS.match(job.source):
-            check = open_source if options.source.is_file() else check_folder
-            check(options)
-        return replace(job, group=options.group_s is not None)
+        if not options.source.is_file():
+            check_folder(options)
+        elif (opened := open_source(options)) is not None and faults.must_read(job.source):
+            check_checksums(opened)
     except (KpcError, OSError) as error:
         faults.add(job.where, (cli.message_of(error) or str(error)).removeprefix(f"{job.source}: "))
-    return job
 
 
 def _parsed(source: str, words: Sequence[str]) -> tuple["Options | None", list[str]]:

@@ -48,7 +48,6 @@ def _command(argv: list[str]) -> None:
     options, words = _parse(argv)
     try:
         batch = _batch(options, words)
-        check_results(batch)
     except FaultyBatch as error:
         *others, last = error.faults
         for fault in others:
@@ -63,6 +62,8 @@ def _command(argv: list[str]) -> None:
     first, known = first_tasks(batch.jobs), done_before(store)
     if options.dry_run:
         print_plan(first, known, options.json)
+        if options.scheduler:
+            _try_scheduler(options.scheduler, batch.jobs)
         return
     ended = _run(batch.jobs, shared, known, options)
     failed = publish(batch.jobs, ended, store, output)
@@ -124,11 +125,26 @@ def _batch(options: argparse.Namespace, words: Sequence[str]) -> Batch:
     if first.suffix == ".toml":
         if len(options.sources) > 1 or words:
             raise UsageError(f"{first}: names scenes and options itself; drop what else is given")
-        return read_jobs(first, options.output)
+        return read_jobs(first, options.output, reads_files=options.dry_run)
     if options.output is None:
         raise UsageError("-o names the folder of the results; give for example -o out/")
-    jobs = jobs_of_folders(options.sources, words, Resources(options.cores, options.memory or 0))
-    return Batch(jobs, resolve(options.output, Path()))
+    resources = Resources(options.cores, options.memory or 0)
+    jobs = jobs_of_folders(options.sources, words, resources, reads_files=options.dry_run)
+    batch = Batch(jobs, resolve(options.output, Path()))
+    check_results(batch)
+    return batch
+
+
+def _try_scheduler(address: str, jobs: Sequence[Job]) -> None:
+    """Say how many workers a scheduler has.
+
+    Raises:
+        ClusterError: it does not answer, or no worker has what a job takes.
+    """
+    from kpc.tools.batch.engine import count_workers
+
+    count = count_workers(address, [job.resources for job in jobs])
+    notice(f"kpbatch: {address}: the scheduler answers, and has {counted(count, 'worker')}")
 
 
 def _parse(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
@@ -158,7 +174,7 @@ def _parse(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--cores", type=_count, default=1, help="of each job, for folders (default: %(default)s)")
     parser.add_argument("--memory", type=memory_size, metavar="3GB", help="of each job, for folders")
     parser.add_argument("--scratch", type=cli.file_name, metavar="DIR", help="folder of workers for what they work on")
-    parser.add_argument("--dry-run", action="store_true", help="only check all jobs, and list what is done")
+    parser.add_argument("--dry-run", action="store_true", help="only check all jobs and files, and list what is done")
     parser.add_argument("--json", action="store_true", help="print a line of JSON for each event, and the results")
     split = argv.index("--") if "--" in argv else len(argv)
     return parser.parse_args(argv[:split]), argv[split + 1 :]
