@@ -3,6 +3,7 @@
 import contextlib
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +22,9 @@ from kpc.encoder.evaluation.profile import profile
 from kpc.encoder.evaluation.validation_rays import VALIDATION_RAYS
 from kpc.format.common import cli, interrupts
 from kpc.format.common.compiling import MONITOR
+from kpc.format.common.text import notice
+from kpc.format.container.groups import Groups
+from kpc.format.container.metadata_options import opening_beyond_limits
 
 __all__ = ["ALL_VIEWS", "Options", "ablations", "dry_run", "encode", "main", "profile_steps"]
 
@@ -38,6 +42,10 @@ def _command(argv: list[str]) -> None:
         print_estimate(dry_run(options), options, as_json)
         return
     print_result(transcode(options) if options.source.is_file() else encode(options), options, as_json)
+    if isinstance(options.view_limits, Mapping):
+        outside = opening_beyond_limits(Groups(options.output).metadata())
+        if outside is not None:
+            notice(f"kpenc: {outside}; kpedit --open-at sets another")
 
 
 def encode(options: Options) -> dict[str, Any]:

@@ -27,6 +27,8 @@ LIMITS = {
     "distance": (math.ulp(0.0), float(BOX_LIMIT), f"lengths above 0, up to {BOX_LIMIT:.3g}"),
     "reach": (0.0, float(BOX_LIMIT), f"a length from 0 to {BOX_LIMIT:.3g}"),
 }
+# By this unit vectors of one direction, and numbers relative to their size, may differ: a file holds seven digits.
+ROUNDING = 1e-5
 
 
 def add_metadata_options(parser: argparse.ArgumentParser) -> None:
@@ -89,6 +91,25 @@ def with_view_limits(metadata: Metadata, wanted: str | Mapping[str, Any]) -> Met
     if limits is None or isinstance(wanted, str):
         raise UsageError("--view-limits: the file has none to change; find them with kpedit --view-limits auto")
     return metadata.with_members(view_limits={**limits, **wanted})
+
+
+def opening_beyond_limits(metadata: Metadata) -> str | None:
+    """Return in words where the opening view lies outside the view limits, so that players do not stay there; None if
+    it lies within, or there are none.
+    """
+    limits, opening = metadata.view_limits, metadata.opening
+    if limits is None or opening is None:
+        return None
+    position = limits.position(opening.camera.camera_to_world[:3, 3])
+    bounds = {"azimuth": limits.azimuth, "elevation": limits.elevation, "distance": limits.distance}
+    outside = [
+        name
+        for number, (name, (low, high)) in zip(position, bounds.items(), strict=True)
+        if not low - ROUNDING * abs(low) <= number <= high + ROUNDING * abs(high)
+    ]
+    if not outside:
+        return None
+    return f"the opening view lies outside the limits of its {' and '.join(outside)}, and players move it within"
 
 
 def _text(name: str) -> Any:

@@ -99,13 +99,17 @@ def test_the_view_is_that_which_the_reference_renderer_finds(variant: str) -> No
 def test_coding_a_file_again_keeps_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = replace(scene_of_five(), metadata=Metadata(FULL))
     scene_writer.write(quantise_scene(scene, [dict.fromkeys(scene.scales[0], 0.05)]), tmp_path / "in.kpc")
-    options = ["--quality", "40", "--tune-steps", "0", "--title", "New", "--view-limits", "reach=0.5"]
+    options = ["--quality", "40", "--tune-steps", "0", "--title", "New", "--view-limits", "reach=0.5,distance=50:60"]
     assert kpenc.main([str(tmp_path / "in.kpc"), "-o", str(tmp_path / "out.kpc"), *options]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "limits" in line]
+    outside = "the opening view lies outside the limits of its elevation and distance, and players move it within"
+    assert said == [f"kpenc: {outside}; kpedit --open-at sets another"]
     found = scene_io.read(tmp_path / "out.kpc").metadata
     changed = ("title", "view_limits", "provenance")
     assert {k: v for k, v in found.document.items() if k not in changed} == {
         k: v for k, v in FULL.items() if k not in changed
     }
-    assert found.title == "New" and found.document["view_limits"] == FULL["view_limits"] | {"reach": 0.5}
+    limits = {"reach": 0.5, "distance": [50, 60]}
+    assert found.title == "New" and found.document["view_limits"] == FULL["view_limits"] | limits
     assert "held_out" not in found.provenance and len(found.provenance["history"]) == 2
     assert "quality 40" in found.provenance["history"][-1]

@@ -32,7 +32,13 @@ from kpc.format.common.version import VERSION
 from kpc.format.container.clip_sound import has_sound
 from kpc.format.container.groups import Groups, load
 from kpc.format.container.metadata_chunk import META_LIMIT
-from kpc.format.container.metadata_options import add_metadata_options, members_from, with_view_limits
+from kpc.format.container.metadata_options import (
+    ROUNDING,
+    add_metadata_options,
+    members_from,
+    opening_beyond_limits,
+    with_view_limits,
+)
 from kpc.format.container.rewriting import save, with_metadata
 from kpc.format.scene.cameras import Camera, load_views
 from kpc.format.scene.metadata import HISTORY_LIMIT, Metadata, camera_document
@@ -42,9 +48,6 @@ from kpc.player.cpu import reference
 from kpc.tools.editing.clips import Edits, edit
 from kpc.tools.editing.placing import Placement, axis_turn
 from kpc.tools.editing.timing import MAX_FPS, MIN_FPS
-
-# By this unit vectors of one direction, and numbers relative to their size, may differ: a file holds seven digits.
-ROUNDING = 1e-5
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -245,7 +248,8 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement:
         view = load_views(options.open_at)[0]
         metadata = metadata.with_members(opening={"camera": camera_document(view.camera), "time": view.time})
     if options.open_at is not None or options.view_limits is not None:
-        _say_if_outside(metadata)
+        if (outside := opening_beyond_limits(metadata)) is not None:
+            notice(f"kpedit: {outside}; --open-at sets another")
     if options.start is not None or options.end is not None or options.box is not None:
         metadata = metadata.with_provenance(held_out=None)  # it was measured on the whole
     if options.provenance is not None:
@@ -256,25 +260,6 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement:
     if options.no_provenance:
         return metadata.with_members(provenance=None)
     return metadata
-
-
-def _say_if_outside(metadata: Metadata) -> None:
-    """Say so if players will not stay at the opening view, since it lies outside the view limits."""
-    limits, opening = metadata.view_limits, metadata.opening
-    if limits is None or opening is None:
-        return
-    position = limits.position(opening.camera.camera_to_world[:3, 3])
-    bounds = {"azimuth": limits.azimuth, "elevation": limits.elevation, "distance": limits.distance}
-    outside = [
-        name
-        for number, (name, (low, high)) in zip(position, bounds.items(), strict=True)
-        if not low - ROUNDING * abs(low) <= number <= high + ROUNDING * abs(high)
-    ]
-    if outside:
-        notice(
-            f"kpedit: the opening view lies outside the limits of its {' and '.join(outside)}, and players move it "
-            "within; --open-at sets another"
-        )
 
 
 def _has_direction(up: np.ndarray | None, wanted: Sequence[float] | None) -> bool:
