@@ -7,7 +7,7 @@ resumed.
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,10 @@ from kpc.format.scene.space import Contraction
 
 # Figures that are reported for each group.
 GROUP_FIGURES = ("size_bytes", "test_psnr", "steps", "train_s", "coding_s", "peak_memory_bytes")
+# Options by which a finished group may differ from those that follow, as a checkpoint from its continuation
+# (`kpc.encoder.training.continuation`).
+LENGTH = ("--steps", "--time-budget")
+DEFAULT = "the default"  # value of an option that is not given, in words
 # Figures that are summed over all groups.
 SUMMED_FIGURES = ("test_pictures", "held_out_pictures", "steps", "train_s", "coding_s")
 
@@ -135,7 +139,7 @@ def _encode_group(options: Options, setting: Setting, before: Path | None) -> di
 
 
 def _read_finished(path: Path, options: Options) -> dict[str, Any]:
-    """Return what was measured of a finished group.
+    """Return what was measured of a finished group; log it if it was trained for another length.
 
     Raises:
         TrainingError: it was encoded with other options, or its figures cannot be read.
@@ -143,19 +147,27 @@ def _read_finished(path: Path, options: Options) -> dict[str, Any]:
     try:
         kept = json.loads(path.with_suffix(".json").read_text())
         before, now = kept["options"], _fingerprint(options)
-        changed = [f"{name} was {before[name]}, is {now[name]}" for name in now if before[name] != now[name]]
-        if changed:
+        changed = [name for name in now if before[name] != now[name]]
+        fixed = [f"{name} was {before[name]}, is {now[name]}" for name in changed if name not in LENGTH]
+        if fixed:
             raise TrainingError(
-                f"{path}: belongs to a run with other settings ({', '.join(changed)}); give the same ones or drop "
-                "--resume"
+                f"{path}: is finished, with other settings ({', '.join(fixed)}), and all groups of a clip have the "
+                "same; give those, or drop --resume to encode all of them anew"
             )
         found: dict[str, Any] = kept["found"]
         if missing := {*GROUP_FIGURES, *SUMMED_FIGURES, "test_psnr_moving", "refine"} - found.keys():
             raise KeyError(*missing)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainingError(f"{path}: its figures cannot be read; delete it to have the group encoded anew") from error
-    log(f"{path}: is finished already")
+    length = f", and stays as long as it was trained ({_length(before)} before, {_length(now)} now)" if changed else ""
+    log(f"{path}: is finished already{length}")
     return found
+
+
+def _length(fingerprint: Mapping[str, str]) -> str:
+    """Return how long a group was trained, as options of kpenc; of a time budget, it names the group's share."""
+    steps, budget_s = (fingerprint[name] for name in LENGTH)
+    return f"--steps {steps}" if budget_s == DEFAULT else f"--time-budget {float(budget_s):.3g}s of this group"
 
 
 def _fingerprint(options: Options) -> dict[str, str]:
@@ -163,7 +175,7 @@ def _fingerprint(options: Options) -> dict[str, str]:
     without = ("resume", "keep", "preview", "trade", "cache", "members")
     given = {name: value for name, value in vars(options).items() if name not in without}
     given |= {name: options.members.get(name) for name in TEXTS}
-    names = {option_name(name): "the default" if value is None else str(value) for name, value in given.items()}
+    names = {option_name(name): DEFAULT if value is None else str(value) for name, value in given.items()}
     return names | {"the target": "{} {:g}".format(*options.trade.bound)}
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import datasets as make
-from kpc.encoder.cli import kpenc, prepare
+from kpc.encoder.cli import encode_groups, kpenc, prepare
 from kpc.encoder.cli.encode_groups import plan_groups
 from kpc.encoder.cli.estimate import Estimate
 from kpc.encoder.cli.grouped import (
@@ -32,7 +32,7 @@ from kpc.encoder.field.layout import Layout
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.encoder.training.moving_area import MovingArea
 from kpc.encoder.training.train import Trainer
-from kpc.format.common.errors import DatasetError, UsageError
+from kpc.format.common.errors import DatasetError, TrainingError, UsageError
 from kpc.format.container import scene_io
 from kpc.format.container.container import ENTRY, HEADER
 from kpc.format.container.groups import Groups, Span, Timeline
@@ -265,6 +265,24 @@ def test_an_interrupted_run_resumes_in_its_group_to_the_same_file(videos, tmp_pa
     err = capsys.readouterr().err
     assert "group-0000.kpc: is finished already" in err and "resumed at step 4" in err
     assert output.read_bytes() == (tmp_path / "whole.kpc").read_bytes()
+
+
+def test_finished_groups_may_have_another_length_but_no_other_options(tmp_path, capsys):
+    """As the checkpoint of a single scene and its continuation."""
+    path, measured = tmp_path / "group-0000.kpc", (*encode_groups.GROUP_FIGURES, *encode_groups.SUMMED_FIGURES)
+    found = dict.fromkeys((*measured, "test_psnr_moving", "refine"), 1)
+    before = Options(tmp_path, tmp_path / "a.kpc", steps=40)
+    path.with_suffix(".json").write_text(json.dumps({"options": encode_groups._fingerprint(before), "found": found}))
+    for options, said in (
+        (before, "is finished already\n"),
+        (replace(before, steps=60), "as long as it was trained (--steps 40 before, --steps 60 now)\n"),
+        (replace(before, steps=None, time_budget_s=7.0), "(--steps 40 before, --time-budget 7s of this group now)\n"),
+    ):
+        assert encode_groups._read_finished(path, options) == found
+        err = capsys.readouterr().err
+        assert err.startswith(f"{path}: is finished already") and err.endswith(said)
+    with pytest.raises(TrainingError, match=r"other settings \(--tune-steps was the default, is 5\), and all groups"):
+        encode_groups._read_finished(path, replace(before, steps=60, tune_steps=5))
 
 
 @pytest.mark.usefixtures("searched")
