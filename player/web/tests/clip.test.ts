@@ -375,6 +375,10 @@ test('a file that is cut off plays as far as it goes', async () => {
 test('what cannot be opened says why', async () => {
   const open = (bytes: Uint8Array) => withServer(bytes, {}, (server) => withClip(server.url, {}, async () => {}));
   await assert.rejects(open(new TextEncoder().encode('<!doctype html>')), hasCode('foreign'));
+  await assert.rejects(
+    withClip(new ArrayBuffer(0), {}, async () => {}),
+    hasCode('empty', 'the file is empty'),
+  );
   await assert.rejects(open(read('spec/vectors/invalid/draft-1.kpc')), hasCode('draft'));
   await assert.rejects(open(SAMPLE.slice(0, 2000)), hasCode('cut-off'));
   const newer = SAMPLE.slice();

@@ -131,7 +131,7 @@ test('keys go by letter, or by place where there are other letters', () => {
 test('every kind of error is a sentence', () => {
   const codes = [
     ...['foreign', 'draft', 'newer', 'cut-off', 'damaged', 'invalid', 'budget', 'not-found', 'blocked', 'replaced'],
-    ...['network', 'worker', 'no-webgl', 'graphics'],
+    ...['empty', 'network', 'worker', 'no-webgl', 'graphics'],
   ] as const;
   const messages = codes.map((code) => {
     const error = playerErrorOf(new KpcError('detail', code), 'https://a.example/b.kpc', 'https://c.example');

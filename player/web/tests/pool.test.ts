@@ -1,6 +1,7 @@
 /** The pool of workers: what it decodes, and what it does about workers that hang or break down. */
 
 import assert from 'node:assert/strict';
+import { getEventListeners } from 'node:events';
 import test from 'node:test';
 
 import { Container } from '../src/container/container.js';
@@ -190,6 +191,16 @@ test('a worker that does not start, or breaks down, is reported', async () => {
   );
   await withPool({ size: 1, spawn: breaking }, async (pool) => {
     await assert.rejects(pool.run(segmentTask(PLANES[0])), hasCode('worker', 'broken'));
+  });
+});
+
+test('a signal has one listener, however many tasks wait, and none once they are done', async () => {
+  const { signal } = new AbortController();
+  await withPool({ size: 1 }, async (pool) => {
+    const runs = PLANES.slice(0, 12).map((number) => pool.run(segmentTask(number), { signal }));
+    assert.equal(getEventListeners(signal, 'abort').length, 1);
+    await Promise.all(runs);
+    assert.equal(getEventListeners(signal, 'abort').length, 0);
   });
 });
 

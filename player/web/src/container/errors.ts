@@ -3,7 +3,7 @@
 /**
  * Kinds of errors: first those of section 11.2 of spec/kpc-format.md, then those of getting the file.
  *
- * `not-found` the server has no such file; `blocked` another site's server does not permit it (CORS); `replaced` the
+ * `empty` the file has no bytes; `not-found` the server has no such file; `blocked` another site's server does not permit it (CORS); `replaced` the
  * file changed while it was read; `network` the server cannot be reached or its answer not be used; `worker` the
  * decoder cannot run; `aborted` the caller ended it; `no-webgl` there is no WebGL2; `graphics` the card cannot draw it.
  */
@@ -15,6 +15,7 @@ export type ErrorCode =
   | 'damaged'
   | 'invalid'
   | 'budget'
+  | 'empty'
   | 'not-found'
   | 'blocked'
   | 'replaced'

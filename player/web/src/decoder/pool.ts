@@ -1,6 +1,7 @@
 /** A pool of workers that decode in parallel, within a limit of memory and a deadline. */
 
 import { BudgetError, type ErrorCode, FormatError, KpcError } from '../container/errors.js';
+import { Endings } from './aborting.js';
 import { coreModule } from './module.js';
 import { type Spawn, spawnFrom, spawnInline, type WorkerPort } from './spawn.js';
 import type { Result, Task } from './tasks.js';
@@ -57,6 +58,7 @@ export class DecoderPool {
   readonly #options: PoolOptions;
   readonly #memory: number;
   readonly #slots: Slot[];
+  readonly #endings = new Endings();
   #queue: Job[] = [];
   #spawn: Spawn;
   #fallback: Spawn | null;
@@ -106,8 +108,7 @@ export class DecoderPool {
         this.#queue = this.#queue.filter((waiting) => waiting !== job);
         reject(new KpcError('decoding was ended', 'aborted'));
       };
-      signal?.addEventListener('abort', abort, { once: true });
-      const settled = () => signal?.removeEventListener('abort', abort);
+      const settled = signal ? this.#endings.add(signal, abort) : () => {};
       job.resolve = (result) => {
         settled();
         resolve(result as Result<T>);

@@ -38,6 +38,8 @@ function sentenceOf(code: PlayerErrorCode, detail: string, src: string, origin: 
       return 'The file cannot be fetched. Check the connection, then try again.';
     case 'replaced':
       return 'The file was replaced while it was read. Try again to see the new one.';
+    case 'empty':
+      return 'The file is empty. Its owner should upload it again.';
     case 'foreign':
       return 'This is not a .kpc file.';
     case 'draft':

@@ -13,7 +13,7 @@
 import { BudgetError, KpcError } from '../container/errors.js';
 import { Connection, TemporaryFailure } from './connection.js';
 import { lengthOf, nameOf, rangeOf, retryAfter, validatorOf } from './http_headers.js';
-import type { ReadOptions, Source } from './source.js';
+import { emptyError, type ReadOptions, type Source } from './source.js';
 
 /** Requested on opening: header and index of 1600 chunks, or the first coarse picture of a short clip. */
 export const FIRST_BYTES = 1 << 16;
@@ -82,7 +82,7 @@ export class HttpSource implements Source {
       source.close();
       throw error;
     }
-    if (source.#beginning.length === 0) throw new KpcError(`${source.name} is empty; upload the file again`, 'cut-off');
+    if (source.#beginning.length === 0) throw emptyError(source.name);
     return source;
   }
 
@@ -163,7 +163,7 @@ export class HttpSource implements Source {
     const [first, , size] = rangeOf(response);
     if (response.status === 416) {
       if (this.size !== null) throw this.#replaced();
-      if (size === 0) throw new KpcError(`${this.name} is empty; upload the file again`, 'cut-off');
+      if (size === 0) throw emptyError(this.name);
       if (size !== null && size < end) {
         this.size = size;
         return this.#request(connection, start, size, fresh);

@@ -6,11 +6,13 @@ import { BudgetError, FormatError } from '../container/errors.js';
 import { KNOWN_KINDS } from '../container/scene.js';
 import type { DecoderPool } from '../decoder/pool.js';
 import type { SceneContent } from '../decoder/tasks.js';
-import type { Source } from './source.js';
+import { emptyError, type Source } from './source.js';
 
 /** Read header and index of a file; the index, which is compressed, in a worker, whose time is limited. */
 export async function openContainer(source: Source, pool: DecoderPool, signal?: AbortSignal): Promise<Container> {
-  const { indexLength, fileLength } = readHeader(await source.read(0, HEADER_LENGTH, { signal }), true);
+  const header = await source.read(0, HEADER_LENGTH, { signal });
+  if (header.length === 0) throw emptyError(source.name);
+  const { indexLength, fileLength } = readHeader(header, true);
   if (source.size !== null && source.size > fileLength) {
     throw new FormatError(`${source.size - fileLength} bytes follow the end of the file`);
   }

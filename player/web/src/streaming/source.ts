@@ -1,5 +1,7 @@
 /** Where a file's bytes come from. */
 
+import { KpcError } from '../container/errors.js';
+
 export interface ReadOptions {
   /** Ends the read, which then throws a KpcError `aborted`. */
   signal?: AbortSignal;
@@ -8,6 +10,9 @@ export interface ReadOptions {
   /** Whether to ask the server although a cache holds the bytes, which came damaged. */
   fresh?: boolean;
 }
+
+/** Return the error of a file without a byte. */
+export const emptyError = (name: string): KpcError => new KpcError(`${name} is empty; upload the file again`, 'empty');
 
 export interface Source {
   /** For messages: no secrets. */
