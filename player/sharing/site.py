@@ -5,6 +5,7 @@ All addresses in the pages are relative, so that the folder may lie anywhere on 
 
 import contextlib
 import hashlib
+import itertools
 import re
 import shutil
 import unicodedata
@@ -31,6 +32,7 @@ PLAYER_FILES = ("kpc-player.js", "kpc-worker.js")
 # How pages written by this module are recognised: only they are replaced, and the files that they record.
 GENERATOR = '<meta name="generator" content="kpshare">'
 RECORD = '<meta name="kpshare-files" content="$files">'
+NAMED = '<meta name="kpshare-name" content="$name">'
 PAGE, POSTER, STYLE = "index.html", "poster.jpg", "page.css"
 
 
@@ -172,17 +174,19 @@ def check_folder(folder: Path, wanted: Mapping[str, Path | bytes]) -> None:
             raise UsageError(f"{path}: is another file, and stays; choose another folder with -o")
 
 
-def with_record(page: str, written: Mapping[str, Path | bytes]) -> str:
+def with_record(page: str, written: Mapping[str, Path | bytes], name: str | None = None) -> str:
     """Return a page that records itself and what was written beside it, so that only this is replaced later.
 
     Args:
         page: markup of a page of this module.
         written: the files, by their names, which are those of `file_name`, or such in a folder of such a name.
+        name: of the scene's file without its suffix, of which a checksum is recorded; None for a gallery.
     """
+    head = GENERATOR if name is None else GENERATOR + "\n" + Template(NAMED).substitute(name=_mark(name))
     listed = " ".join(f"{name}={_checksum(content)}" for name, content in written.items())
 
     def recording(files: str) -> str:
-        return page.replace(GENERATOR, GENERATOR + "\n" + Template(RECORD).substitute(files=files), 1)
+        return page.replace(GENERATOR, head + "\n" + Template(RECORD).substitute(files=files), 1)
 
     return recording(f"{listed} {PAGE}={_checksum(recording(listed).encode())}")
 
@@ -295,31 +299,78 @@ def copy_file(source: Path | bytes, target: Path) -> None:
 def file_name(name: str) -> str:
     """Return a name like this one that every web host can serve: letters, digits, dots, dashes and underlines.
 
-    A name that loses letters of other scripts ends in a part of its SHA-256, so that the address of a scene does not
-    depend on which others are shared.
+    A name that has to be changed ends in a part of its SHA-256, so that the address of a scene does not depend on which
+    others are shared.
     """
     name = unicodedata.normalize("NFC", name)  # macOS takes letters and their accents apart
-    found = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "scene"
-    if name.isascii():
-        return found
-    return f"{found}-{_checksum(name.encode(errors='surrogateescape'))[:8]}"
+    return name if _reduced(name) == name else _marked(name)
 
 
-def distinct_names(names: Sequence[str]) -> list[str]:
+def distinct_names(names: Sequence[str], published: Mapping[str, str] | None = None) -> list[str]:
     """Return names for files or folders of a site, none of which differs from another by capitals alone.
 
-    None is that of a file that lies beside them.
+    None is that of a file that lies beside them. Each follows from its own name, but where names differ by capitals
+    alone: one of them is marked as `file_name` does, rather not one that is published, nor one without capitals.
+
+    Args:
+        names: without suffixes.
+        published: names that some of them had until now (`published_names`), which they keep.
     """
+    published = {} if published is None else published
     taken = {PAGE, POSTER, STYLE, *PLAYER_FILES}
-    found = []
-    for name in map(file_name, names):
-        candidate, number = name, 1
-        while candidate.lower() in taken:
-            number += 1
-            candidate = f"{name}-{number}"
-        taken.add(candidate.lower())
-        found.append(candidate)
+    found = [""] * len(names)
+    order = sorted(range(len(names)), key=lambda k: (names[k] not in published, names[k] != names[k].lower()))
+    for number in order:
+        name = names[number]
+        wanted = [published[name]] if name in published else []
+        wanted += [file_name(name), _marked(name)]
+        others = (f"{wanted[-1]}-{count}" for count in itertools.count(2))  # for files of one name in several folders
+        found[number] = next(one for one in itertools.chain(wanted, others) if one.lower() not in taken)
+        taken.add(found[number].lower())
     return found
+
+
+def published_names(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    """Return the names of the site in a folder under which scenes are published there, by the names of their files.
+
+    Pages record of which file they are; those of versions that did not are taken to be of the only one of `names` that
+    their own may stand for.
+    """
+    found: dict[str, str] = {}
+    for recorded in _recorded(_text_of(folder / PAGE)):
+        address, _, rest = recorded.partition("/")
+        if not rest and address.endswith(".kpc"):  # beside the page of a single scene
+            address, page = address.removesuffix(".kpc"), PAGE
+        elif rest == PAGE:
+            page = recorded
+        else:
+            continue
+        if address != file_name(address):
+            continue
+        before, _, after = NAMED.partition("$name")
+        mark = re.search(f'{re.escape(before)}([^"]*){re.escape(after)}', _text_of(folder / page))
+        of = [
+            name
+            for name in dict.fromkeys(names)
+            if (_reduced(name) == address if mark is None else _mark(name) == mark[1])
+        ]
+        if len(of) == 1:
+            found.setdefault(of[0], address)
+    return found
+
+
+def _reduced(name: str) -> str:
+    """Return a name without what a web host may not serve."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", unicodedata.normalize("NFC", name)).strip("-.") or "scene"
+
+
+def _marked(name: str) -> str:
+    return f"{_reduced(name)}-{_mark(name)}"
+
+
+def _mark(name: str) -> str:
+    """Return a part of the SHA-256 of a name, by which it is distinguished from others."""
+    return _checksum(unicodedata.normalize("NFC", name).encode(errors="surrogateescape"))[:8]
 
 
 def _preview(poster: str | None, url: str | None) -> str:

@@ -90,10 +90,10 @@ def test_a_published_address_makes_link_previews_whole() -> None:
 @pytest.mark.parametrize(
     ("names", "wanted"),
     [
-        (["a", "A", "b"], ["a", "A-2", "b"]),
-        (["zwei Köpfe", "..", "con/../x"], ["zwei-K-pfe-9099442b", "scene", "con-..-x"]),
-        (["index.html", "Page.css", "kpc-player.js"], ["index.html-2", "Page.css-2", "kpc-player.js-2"]),
-        (["a", "a", "a-2"], ["a", "a-2", "a-2-2"]),
+        (["A", "a", "b"], ["A-559aead0", "a", "b"]),
+        (["zwei Köpfe", "..", "con/../x"], ["zwei-K-pfe-9099442b", "scene-5ec1f7e7", "con-..-x-238fb55b"]),
+        (["index.html", "Page.css"], ["index.html-0eb54730", "Page.css-d804dc54"]),
+        (["a", "a", "a", "a-2"], ["a", "a-ca978112", "a-ca978112-2", "a-2"]),
     ],
 )
 def test_names_suit_every_host(names: list[str], wanted: list[str]) -> None:
@@ -101,8 +101,9 @@ def test_names_suit_every_host(names: list[str], wanted: list[str]) -> None:
 
 
 def test_the_address_of_a_scene_does_not_depend_on_others() -> None:
-    both = site.distinct_names(["日本", "動画"])
-    assert both == [*site.distinct_names(["日本"]), *site.distinct_names(["動画"])]
+    for one, other in ("日本", "動画"), ("a b", "a-b"), ("kpc-player.js", "kpc-player-js"):
+        both = site.distinct_names([one, other])
+        assert both == [*site.distinct_names([one]), *site.distinct_names([other])]
     assert site.distinct_names(["Ko\u0308pfe"]) == site.distinct_names(["Köpfe"]), "as macOS writes it, too"
     assert site.distinct_names(["caf\udce9"])[0].startswith("caf-")
 
@@ -132,9 +133,33 @@ def test_several_scenes_become_a_gallery(tmp_path: Path, quick_posters: None) ->
     gallery = Page((folder / "index.html").read_text())
     assert gallery.tags.count("img") == 2 and gallery.content("og:title") == "my scenes"
     pages = [address for address in gallery.addresses() if address.endswith("index.html")]
-    assert pages == ["one/index.html", "two-2/index.html"]
+    assert pages == ["one/index.html", "two-2-0a37c70c/index.html"]
     for page in (folder / address for address in pages):
         assert all((page.parent / address).is_file() for address in Page(page.read_text()).addresses())
+
+
+def test_what_is_published_keeps_its_address(
+    tmp_path: Path, quick_posters: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also in a site of a version that numbered names of which only one could stay, and did not record them."""
+    scenes, folder, with_record = tmp_path / "scenes", tmp_path / "site", site.with_record
+    scenes.mkdir()
+
+    def addresses(*names: str) -> list[str]:
+        for name in names:
+            shutil.copy(SAMPLE, scenes / f"{name}.kpc")
+        assert kpshare.main(["--gallery", str(scenes), "-o", str(folder)]) == 0
+        found = Page((folder / "index.html").read_text()).addresses()
+        return [address.removesuffix("/index.html") for address in found if address.endswith("/index.html")]
+
+    with monkeypatch.context() as older:
+        older.setattr(site, "file_name", site._reduced)
+        older.setattr(site, "with_record", lambda page, written, name=None: with_record(page, written))
+        assert addresses("a b", "B") == ["B", "a-b"]
+    assert addresses("c") == ["B", "a-b", "c"]
+    assert addresses("a-b", "b") == ["B", "a-b", "a-b-d44362d6", "b-3e23e816", "c"]
+    (scenes / "c.kpc").unlink()
+    assert addresses() == ["B", "a-b", "a-b-d44362d6", "b-3e23e816"]
 
 
 def test_the_page_of_someone_else_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -303,7 +328,7 @@ def test_a_browser_gets_page_player_and_scene(tmp_path: Path) -> None:
         addresses = Page(page.decode()).addresses()
         types = {address: read(url + address)[1]["content-type"] for address in addresses}
         assert "javascript" in types["kpc-player.js"] and "text/css" in types["page.css"]
-        part, headers = read(url + "a-b.kpc", Range="bytes=4-9")
+        part, headers = read(url + "a-b-c8687a08.kpc", Range="bytes=4-9")
         assert part == SAMPLE.read_bytes()[4:10] and headers["content-range"] == f"bytes 4-9/{SAMPLE.stat().st_size}"
 
 
@@ -332,7 +357,8 @@ def test_a_scene_elsewhere_may_be_loaded_from_there_alone(tmp_path: Path) -> Non
             assert ("kpc-player", "src", f"{host}default.kpc") in page.attributes
             policy = page.content("Content-Security-Policy")
             assert policy.endswith(f"connect-src 'self' {host.rstrip('/')}")
-            assert [a for a in gallery.addresses() if "default" in a] == ["default/index.html", "default-2/index.html"]
+            pages = [address for address in gallery.addresses() if "default" in address]
+            assert pages == ["default/index.html", "default-37a8eec1/index.html"]
 
 
 def test_options_of_the_window_are_refused_for_a_page(capsys: pytest.CaptureFixture[str]) -> None:

@@ -46,7 +46,8 @@ def _command(argv: list[str]) -> None:
     is_gallery = options.gallery is not None or len(files) > 1
     folder = options.output
     cli.check_writable(folder, is_folder=True)
-    names = site.distinct_names([file.stem for file in files])
+    stems = [file.stem for file in files]
+    names = site.distinct_names(stems, site.published_names(folder, stems))
     folders = [folder / name if is_gallery else folder for name in names]
     player = site.player_files()
     at_page = {} if is_gallery else player  # those of a gallery lie above its pages
@@ -82,7 +83,7 @@ def _command(argv: list[str]) -> None:
                 site.copy_file(source, place / beside_name)
             url = None if options.url is None else urljoin(options.url, f"{name}/" if is_gallery else "")
             page = site.scene_page(scene, root=root, url=url)
-            site.write_file(place / site.PAGE, site.with_record(page, own))
+            site.write_file(place / site.PAGE, site.with_record(page, own, scene.name))
             pages[f"{name}/{site.PAGE}"] = place / site.PAGE
         if is_gallery:
             title = options.title or (options.gallery or folder).absolute().name
