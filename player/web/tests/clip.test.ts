@@ -4,15 +4,15 @@ import assert from 'node:assert/strict';
 import test from 'node:test';
 
 import { Container } from '../src/container/container.js';
-import { type ErrorCode, KpcError } from '../src/container/errors.js';
 import { Scene } from '../src/container/scene.js';
 import { isTimePlane, PLANES, type PlaneHead } from '../src/container/scene_chunks.js';
 import { loadCore } from '../src/decoder/module.js';
 import { layerTexels } from '../src/decoder/texels.js';
-import { Clip, type ClipOptions, type SceneEvent } from '../src/streaming/clip.js';
-import type { SceneStream, TexelRows } from '../src/streaming/scene_stream.js';
+import { Clip, type SceneEvent } from '../src/streaming/clip.js';
+import type { TexelRows } from '../src/streaming/scene_stream.js';
 import { read } from './files.js';
-import { spawnNode, spawnScript } from './node_worker.js';
+import { spawnScript } from './node_worker.js';
+import { hasCode, until, withClip } from './playing.js';
 import { withServer } from './server.js';
 import { grouped, scene } from './writing.js';
 
@@ -34,52 +34,11 @@ const SHORT = {
 };
 const core = await loadCore();
 
-const hasCode =
-  (code: ErrorCode, words = '') =>
-  (error: unknown) =>
-    error instanceof KpcError && error.code === code && error.message.includes(words);
-
-async function withClip(
-  src: string | ArrayBuffer,
-  options: ClipOptions,
-  body: (clip: Clip) => Promise<void>,
-): Promise<void> {
-  const pool = { size: 2, spawn: spawnNode, ...options.pool };
-  const clip = await Clip.open(src, { firstPauseMs: 5, ...options, pool });
-  try {
-    await body(clip);
-  } finally {
-    clip.close();
-  }
-}
-
 test('the index is read in a worker, whose time is limited', async () => {
   const endless = spawnScript('globalThis.onmessage = ({ data }) => "module" in data && postMessage({ ready: true });');
   const opening = Clip.open(SAMPLE.slice().buffer, { pool: { spawn: endless, deadlineMs: 500 } });
   await assert.rejects(opening, hasCode('invalid', 'takes longer than 0.5 s'));
 });
-
-/** Wait until something holds, looking again whenever something has arrived; take all texels meanwhile. */
-async function until(
-  clip: Clip,
-  holds: () => unknown,
-  taken: (scene: SceneStream, rows: TexelRows) => void = () => {},
-) {
-  for (;;) {
-    for (const one of clip.scenes) for (const rows of one.take(Number.POSITIVE_INFINITY)) taken(one, rows);
-    if (holds()) return;
-    if (clip.error) throw clip.error;
-    await new Promise<void>((resolve) => {
-      const wake = () => {
-        clip.removeEventListener('arrived', wake);
-        clearTimeout(timer);
-        resolve();
-      };
-      const timer = setTimeout(wake, 20);
-      clip.addEventListener('arrived', wake);
-    });
-  }
-}
 
 /** Compare a scene that has arrived with one that was decoded at once. */
 async function hasAll(clip: Clip, expected: Scene): Promise<void> {

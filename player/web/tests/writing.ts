@@ -14,6 +14,8 @@ export interface Part {
   rowCount?: number;
   codec?: number;
   rawLength?: number;
+  /** Another checksum than that of the body. */
+  crc?: number;
 }
 
 /** Return a file of chunks. */
@@ -32,7 +34,7 @@ export function file(parts: Part[], valueCount: number): Uint8Array<ArrayBuffer>
       .u16(part.codec ?? CODEC.RAW)
       .u32(part.body.length)
       .u32(part.rawLength ?? part.body.length)
-      .u32(crc32c(part.body));
+      .u32(part.crc ?? crc32c(part.body));
     for (const [k, byte] of row.bytes().entries()) table[k * parts.length + number] = byte;
   }
   const index = rawFrame(table);
@@ -67,10 +69,18 @@ export interface SceneSizes {
   segmentRows: number;
   /** Chunks behind all others. */
   others?: Part[];
+  /** What the symbols of time planes depend on. */
+  seed?: number;
 }
 
 /** Return a scene of symbols that look random. */
-export function scene({ scales, frameCount, segmentRows, others: more = [] }: SceneSizes): Uint8Array<ArrayBuffer> {
+export function scene(sizes: SceneSizes): Uint8Array<ArrayBuffer> {
+  const { parts, valueCount } = sceneParts(sizes);
+  return file(parts, valueCount);
+}
+
+/** Return the chunks of such a scene, and how many values it has. */
+function sceneParts({ scales, frameCount, segmentRows, others: more = [], seed: start = 1 }: SceneSizes) {
   const isDynamic = scales[0][4] > 0;
   const names = isDynamic ? ['xy', 'xz', 'yz', 'xt', 'yt', 'zt'] : ['xy', 'xz', 'yz'];
   const head = new Writer();
@@ -78,7 +88,7 @@ export function scene({ scales, frameCount, segmentRows, others: more = [] }: Sc
   head.u32(frameCount).f64(10).f64(0.01);
   for (let k = 0; k < 3; k++) head.f32(0);
   head.u8(scales.length).u8(isDynamic ? 1 : 0);
-  let [values, features, seed] = [0, 0, 1];
+  let [valueCount, features] = [0, 0];
   const [spaces, firsts, laters]: Part[][] = [[], [], []];
   for (const [scale, [channels, x, y, z, t]] of scales.entries()) {
     head.u16(channels).u16(x).u16(y).u16(z).u16(t);
@@ -88,11 +98,12 @@ export function scene({ scales, frameCount, segmentRows, others: more = [] }: Sc
       for (let k = 0; k < channels; k++) head.f32(0.01 * (k + 1));
       for (let k = 0; k < channels && plane < 3; k++) head.f32(0.5);
       const [columns, rows] = [sizes[name[0]], sizes[name[1]]];
-      values += rows * columns * channels;
+      valueCount += rows * columns * channels;
       const most = plane < 3 ? rows : segmentRows;
       for (let rowStart = 0; rowStart < rows; rowStart += most) {
         const rowCount = Math.min(most, rows - rowStart);
         const body = new Uint8Array(1 + rowCount * columns * channels);
+        let seed = 1000 * scale + 100 * plane + rowStart + (plane < 3 ? 0 : 10_000 * start);
         for (let k = 1; k < body.length; k++) {
           seed = Math.imul(seed, 1664525) + 1013904223;
           body[k] = seed >>> 24;
@@ -110,15 +121,55 @@ export function scene({ scales, frameCount, segmentRows, others: more = [] }: Sc
   const order = [...spaces, ...firsts].sort((a, b) => byScale(a) - byScale(b));
   laters.sort((a, b) => (a.rowStart ?? 0) - (b.rowStart ?? 0));
   const others = [head, weights, occupancy].map((one, k) => ({ kind: ['SCNE', 'DECO', 'OCCU'][k], body: one.bytes() }));
-  return file([...others, ...order, ...laters, ...more], values);
+  const parts: Part[] = [...others, ...order, ...laters, ...more];
+  return { parts, valueCount };
 }
 
-/** Return a clip of groups, each of which shares some frames with the one before it. */
-export function grouped(scenes: Uint8Array[], frameCount: number, shared: number, valueCount: number) {
+/** Return a clip of groups, each of which has some frames in common with the one before it, between other chunks. */
+export function grouped(
+  scenes: Uint8Array[],
+  frameCount: number,
+  common: number,
+  valueCount: number,
+  before: Part[] = [],
+  behind: Part[] = [],
+) {
   const parts = scenes.map((body, group) => {
-    return { kind: 'GRUP', body, group, rowStart: group * (frameCount - shared), rowCount: frameCount };
+    return { kind: 'GRUP', body, group, rowStart: group * (frameCount - common), rowCount: frameCount };
   });
-  return file(parts, valueCount);
+  return file([...before, ...parts, ...behind], valueCount);
+}
+
+/** What `sharing` writes instead: of the shared planes, and of the chunks of each group. */
+export interface Changes {
+  shared?: (parts: Part[]) => Part[];
+  own?: (parts: Part[], group: number) => Part[];
+  /** Whether a shared plane lies behind the groups. */
+  isBehind?: (part: Part) => boolean;
+}
+
+/**
+ * Return a clip of groups that have time planes of their own, and share their space planes, which lie before them; and
+ * the same groups as files of their own.
+ */
+export function sharing(
+  sizes: SceneSizes,
+  groupCount: number,
+  common: number,
+  { shared = (parts) => parts, own = (parts) => parts, isBehind = () => false }: Changes = {},
+) {
+  const groups = Array.from({ length: groupCount }, (_, group) => sceneParts({ ...sizes, seed: group + 1 }));
+  const [{ parts, valueCount }] = groups;
+  const isSpace = ({ kind, plane = 0 }: Part) => kind === 'PLNE' && plane < 3;
+  const standIn = (part: Part): Part =>
+    isSpace(part) ? { ...part, body: new Uint8Array(0), rawLength: part.body.length, codec: CODEC.SHARED } : part;
+  const planes = shared(parts.filter(isSpace));
+  const [before, behind] = [planes.filter((part) => !isBehind(part)), planes.filter(isBehind)];
+  const bodies = groups.map((one, group) => file(own(one.parts.map(standIn), group), valueCount));
+  return {
+    clip: grouped(bodies, sizes.frameCount, common, valueCount, before, behind),
+    scenes: groups.map((one) => file(one.parts, valueCount)),
+  };
 }
 
 class Writer {

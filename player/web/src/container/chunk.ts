@@ -6,7 +6,11 @@ import { unpackFrame } from './zstd.js';
 
 /** EXPANSION_LIMIT of section 11.1. */
 export const EXPANSION_LIMIT = 32768;
-export const CODEC = { RAW: 0, ZSTD: 1, PREDICTIVE: 2, TRANSFORM: 3, MOTION: 4, OCCUPANCY: 5, WEIGHTS: 6, POSES: 7 };
+export const CODEC = {
+  ...{ RAW: 0, ZSTD: 1, PREDICTIVE: 2, TRANSFORM: 3, MOTION: 4, OCCUPANCY: 5, WEIGHTS: 6, POSES: 7 },
+  /** In a group of a clip: a plane that lies beside the groups. */
+  SHARED: 8,
+};
 
 /** A chunk, as the index lists it; `offset` is its position in the file. */
 export interface Entry {

@@ -29,7 +29,7 @@ export interface ContainerOptions {
   allowPartial?: boolean;
   /** Stored chunks beyond the bytes that are given, by their numbers. */
   bodies?: ReadonlyMap<number, Uint8Array>;
-  /** What `readIndex` made of the bytes elsewhere; without it, the index is read here. */
+  /** The index where it was read elsewhere; without it, it is read here. */
   index?: readonly Entry[];
 }
 

@@ -1,11 +1,13 @@
 /** Clips in groups (section 4.7 of spec/kpc-format.md). */
 
 import type { Core } from '../decoder/core.js';
+import type { Entry } from './chunk.js';
 import { Container, HEADER_LENGTH } from './container.js';
 import { FormatError } from './errors.js';
 import { META_LIMIT, type Metadata, parseMetadata } from './metadata.js';
 import { Scene, type SceneOptions } from './scene.js';
 import type { SceneHead } from './scene_chunks.js';
+import { sharedPlanes, sharedStart, usablePlanes, withShared } from './shared_planes.js';
 import { groupChunks, groupSpans, Timeline } from './timeline.js';
 
 /** The groups of a file. A file without GRUP chunks counts as one group. */
@@ -15,6 +17,7 @@ export class Groups {
   readonly first: Scene;
   readonly metadata: Metadata;
   readonly chunks: number[];
+  #sharedPlanes: readonly Entry[] = [];
 
   constructor(
     bytes: Uint8Array,
@@ -28,15 +31,19 @@ export class Groups {
       this.first = new Scene(bytes, core, options);
       this.timeline = new Timeline([{ first: 0, last: this.first.head.frameCount - 1 }]);
     } else {
+      this.#sharedPlanes = sharedPlanes(index, this.chunks.length);
       this.timeline = new Timeline(groupSpans(index, this.chunks));
       this.first = this.#open(0);
     }
     this.metadata = this.#metadata();
   }
 
-  /** Whether a group is complete. */
+  /** Whether a group is complete, and all planes are there that it may share. */
   available(number: number): boolean {
-    return this.chunks.length === 0 || this.container.available(this.chunks[number]);
+    if (this.chunks.length === 0) return true;
+    const shared = [...usablePlanes(this.#sharedPlanes, number).values()];
+    const areThere = shared.every(({ offset, storedLength }) => offset + storedLength <= this.container.bytes.length);
+    return areThere && this.container.available(this.chunks[number]);
   }
 
   /** Open the scene of a group. */
@@ -47,10 +54,14 @@ export class Groups {
   #open(number: number): Scene {
     const entry = this.container.index[this.chunks[number]];
     const bytes = this.container.bytes.subarray(entry.offset, entry.offset + entry.storedLength);
-    const allowPartial = !this.available(number);
+    const allowPartial = !this.container.available(this.chunks[number]);
     if (allowPartial && bytes.length < HEADER_LENGTH)
       throw new FormatError(`cut off: group ${number} is not there`, 'cut-off');
-    const scene = new Scene(bytes, this.core, { ...this.options, allowPartial });
+    const scene = new Scene(bytes, this.core, {
+      ...this.options,
+      allowPartial,
+      ...this.#shared(number, bytes, allowPartial),
+    });
     checkGroup(
       number,
       scene.head,
@@ -59,6 +70,19 @@ export class Groups {
       number === 0 ? scene.head.fps : this.first.head.fps,
     );
     return scene;
+  }
+
+  /** Return the index of a group with the planes that it shares, and those of them that are there. */
+  #shared(number: number, bytes: Uint8Array, allowPartial: boolean) {
+    const { header, index: own } = new Container(bytes, { allowPartial });
+    const index = withShared(own, number, this.#sharedPlanes, header.fileLength);
+    const bodies = new Map<number, Uint8Array>();
+    for (const [chunk, { offset, storedLength }] of index.entries()) {
+      const start = offset - sharedStart(header.fileLength);
+      const body = start < 0 ? null : this.container.bytes.subarray(start, start + storedLength);
+      if (body?.length === storedLength) bodies.set(chunk, body);
+    }
+    return { index, bodies };
   }
 
   #metadata(): Metadata {

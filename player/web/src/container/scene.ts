@@ -32,6 +32,7 @@ import {
   type Scale,
   type SceneHead,
 } from './scene_chunks.js';
+import { isShared } from './shared_planes.js';
 import { parseSound, SOUND_LIMIT, type Sound, type SoundSegment, soundChunks, soundOf } from './sound.js';
 
 export const KNOWN_KINDS = ['SCNE', 'WARP', 'MOVE', 'DECO', 'HYBR', 'OCCU', 'came', 'appe', 'meta', 'soun', 'PLNE'];
@@ -266,6 +267,12 @@ export class Scene {
     const { index } = this.container;
     if (index.some((entry) => entry.kind === 'GRUP')) {
       throw new FormatError('a clip in groups, where a single scene is wanted');
+    }
+    const shared = index.findIndex(isShared);
+    if (shared >= 0) {
+      throw new FormatError(
+        `chunk ${shared} (PLNE) stands for a shared plane, which a group of a clip alone has; encode it again`,
+      );
     }
     const unknown = index.findIndex((entry) => isCritical(entry) && !KNOWN_KINDS.includes(entry.kind));
     if (unknown >= 0) {

@@ -89,8 +89,10 @@ export function groupChunks(index: readonly Entry[]): number[] {
   if (chunks.length === 0) return [];
   for (const [number, entry] of index.entries()) {
     if (entry.kind !== 'GRUP') {
-      if (isCritical(entry))
+      // PLNE chunks there are shared planes.
+      if (isCritical(entry) && entry.kind !== 'PLNE') {
         throw new FormatError(`chunk ${number} (${entry.kind}) lies outside the groups; update kpc`);
+      }
     } else if (
       entry.codec !== CODEC.RAW ||
       entry.rawLength !== entry.storedLength ||

@@ -43,6 +43,8 @@ export interface IndexTask {
 export interface SceneTask {
   kind: 'scene';
   start: Uint8Array;
+  /** The index if it is another than that of `start`, in which planes that groups share are under SHARED. */
+  index?: readonly Entry[];
   bodies: ReadonlyMap<number, Uint8Array>;
   memoryBudget: number;
 }
@@ -146,8 +148,8 @@ export function perform(core: Core, task: Task): { result: Result<Task>; moved: 
   }
 }
 
-function readScene(core: Core, { start, bodies, memoryBudget }: SceneTask) {
-  const scene = new Scene(start, core, { allowPartial: true, inParts: true, bodies, memoryBudget });
+function readScene(core: Core, { start, index, bodies, memoryBudget }: SceneTask) {
+  const scene = new Scene(start, core, { allowPartial: true, inParts: true, index, bodies, memoryBudget });
   const { head, mapping, motion, occupancy, decoder, cameras, appearances, metadata } = scene;
   const result = { head, mapping, motion, occupancy, decoder, cameras, appearances, metadata };
   const moved = [occupancy.occupied.buffer as ArrayBuffer];

@@ -9,12 +9,14 @@ import { asKpcError, BudgetError, FormatError, KpcError } from '../container/err
 import { checkGroup } from '../container/groups.js';
 import type { Metadata } from '../container/metadata.js';
 import type { Camera, SceneHead } from '../container/scene_chunks.js';
+import { sharedPlanes } from '../container/shared_planes.js';
 import { groupChunks, groupSpans, Timeline } from '../container/timeline.js';
 import { DecoderPool, type PoolOptions } from '../decoder/pool.js';
 import { type HttpOptions, HttpSource } from './http.js';
 import { openContainer } from './opening.js';
 import type { Playhead } from './prefetch.js';
 import { SceneStream } from './scene_stream.js';
+import { SharedPlanes } from './shared_source.js';
 import { BlobSource, BytesSource, SlicedSource, type Source } from './source.js';
 
 /** The memory that a clip may take where the page does not say. */
@@ -68,6 +70,8 @@ interface Opened {
   timeline: Timeline;
   /** The file of each group. */
   files: Source[];
+  /** The planes that groups share; null of a single scene. */
+  shared: SharedPlanes | null;
   /** Checks what a group holds. */
   check: (group: number, head: SceneHead) => void;
   memory: number;
@@ -151,7 +155,10 @@ export class Clip extends EventTarget {
     const chunks = groupChunks(index);
     const isSingle = chunks.length === 0;
     const isWhole = source instanceof HttpSource && !source.hasRanges;
-    const kept = pool.memory + (isWhole ? header.fileLength : source.memoryBytes);
+    // What the page has, or has received as a whole, is not kept twice.
+    const sharedLimit = source instanceof HttpSource && !isWhole ? Math.floor(memory / 8) : 0;
+    const shared = isSingle ? null : new SharedPlanes(source, sharedPlanes(index, chunks.length), sharedLimit);
+    const kept = pool.memory + (isWhole ? header.fileLength : source.memoryBytes) + (shared?.mostBytes ?? 0);
     const opened: Opened = {
       source,
       pool,
@@ -163,6 +170,7 @@ export class Clip extends EventTarget {
             const { offset, storedLength } = index[chunk];
             return new SlicedSource(source, offset, storedLength, `${source.name}, group ${group}`);
           }),
+      shared,
       check: (group, head) => {
         if (isSingle) return;
         checkGroup(group, head, index[chunks[group]].rowCount, header.valueCount, clip?.fps ?? head.fps);
@@ -297,11 +305,9 @@ export class Clip extends EventTarget {
 
   /** Bytes that the clip takes, as far as the budget counts them. */
   get memoryBytes(): number {
-    const { pool, source } = this.#opened;
-    return this.scenes.reduce(
-      (sum, scene) => sum + scene.fixedBytes + scene.heldBytes,
-      pool.memory + source.memoryBytes,
-    );
+    const { pool, source, shared } = this.#opened;
+    const kept = pool.memory + source.memoryBytes + (shared?.memoryBytes ?? 0);
+    return this.scenes.reduce((sum, scene) => sum + scene.fixedBytes + scene.heldBytes, kept);
   }
 
   /** End requests and workers. */
@@ -406,13 +412,14 @@ async function sourceOf(src: string | URL | Blob | ArrayBuffer, options: HttpOpt
 }
 
 async function openGroup(
-  { files, pool, check, memory }: Opened,
+  { files, shared, pool, check, memory }: Opened,
   group: number,
   changed: () => void,
   signal?: AbortSignal,
 ): Promise<SceneStream> {
   return SceneStream.open(files[group], pool, {
     group,
+    shared,
     memory,
     changed,
     signal,

@@ -6,7 +6,7 @@ import { BudgetError, FormatError } from '../container/errors.js';
 import { KNOWN_KINDS } from '../container/scene.js';
 import type { DecoderPool } from '../decoder/pool.js';
 import type { SceneContent } from '../decoder/tasks.js';
-import { emptyError, type Source } from './source.js';
+import { emptyError, reaches, type Source } from './source.js';
 
 /** Read header and index of a file; the index, which is compressed, in a worker, whose time is limited. */
 export async function openContainer(source: Source, pool: DecoderPool, signal?: AbortSignal): Promise<Container> {
@@ -40,13 +40,12 @@ export function adjacentRuns(index: readonly Entry[], numbers: readonly number[]
 }
 
 /** Whether a chunk is there, as far as is known. */
-export const isThere = (entry: Entry, source: Source): boolean =>
-  source.size === null || entry.offset + entry.storedLength <= source.size;
+export const isThere = (entry: Entry, source: Source): boolean => reaches(source, entry.offset + entry.storedLength);
 
 /** Read everything that is in a scene but planes and sound. */
 export async function readContent(
   source: Source,
-  { index, bytes }: Container,
+  { header, index, bytes }: Container,
   pool: DecoderPool,
   memory: number,
   signal?: AbortSignal,
@@ -68,6 +67,8 @@ export async function readContent(
       if (body.length === storedLength) bodies.set(number, body);
     }
   }
-  const start = bytes.slice(0, index[0].offset);
-  return pool.run({ kind: 'scene', start, bodies, memoryBudget: memory }, { signal });
+  const start = bytes.slice(0, HEADER_LENGTH + header.indexLength);
+  const isSharing = index.some(({ offset }) => offset > header.fileLength);
+  const task = { kind: 'scene', start, index: isSharing ? index : undefined, bodies, memoryBudget: memory } as const;
+  return pool.run(task, { signal });
 }

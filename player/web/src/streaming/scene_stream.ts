@@ -28,6 +28,7 @@ import {
   segmentsOf,
   segmentsToKeep,
 } from './prefetch.js';
+import type { SharedPlanes } from './shared_source.js';
 import { SoundStream } from './sound_stream.js';
 import type { Source } from './source.js';
 import { TimePlane } from './time_plane.js';
@@ -56,6 +57,8 @@ export interface TexelRows {
 export interface SceneStreamOptions {
   /** The group of the clip. */
   group?: number;
+  /** The planes that the groups of the clip share; without them, the scene is no group. */
+  shared?: SharedPlanes | null;
   /** Bytes that the scene may take, on the graphics card, too. */
   memory: number;
   /** Called when something has come, or has failed. */
@@ -87,7 +90,7 @@ export class SceneStream {
   /** Why nothing more will come; null if it will. */
   error: KpcError | null = null;
   readonly sound: SoundStream;
-  readonly #source: BegunSource;
+  readonly #source: Source;
   readonly #pool: DecoderPool;
   readonly #container: Container;
   readonly #content: SceneContent;
@@ -109,7 +112,7 @@ export class SceneStream {
   #isResting = false;
 
   private constructor(
-    source: BegunSource,
+    source: Source,
     pool: DecoderPool,
     container: Container,
     content: SceneContent,
@@ -152,13 +155,14 @@ export class SceneStream {
 
   /** Open a scene: wait for its header, its index and all chunks but planes, which `setPlayhead` lets come. */
   static async open(source: Source, pool: DecoderPool, options: SceneStreamOptions): Promise<SceneStream> {
-    const { signal } = options;
+    const { group = 0, shared, signal } = options;
     const begun = new BegunSource(source, FIRST_BYTES);
     try {
-      const container = await openContainer(begun, pool, signal);
-      const content = await readContent(begun, container, pool, options.memory, signal);
+      const own = await openContainer(begun, pool, signal);
+      const { source: whole, container } = shared?.join(begun, own, group) ?? { source: begun, container: own };
+      const content = await readContent(whole, container, pool, options.memory, signal);
       options.check?.(content, container);
-      return new SceneStream(begun, pool, container, content, options);
+      return new SceneStream(whole, pool, container, content, options);
     } catch (error) {
       begun.close();
       throw error;

@@ -23,10 +23,16 @@ export interface Source {
   readonly receivedBytes: number;
   /** Bytes of memory that the source takes. */
   readonly memoryBytes: number;
+  /** Whether the bytes of a chunk that ends at `end` are there, as far as is known; without it, `size` says that. */
+  reaches?(end: number): boolean;
   /** Return the bytes from `start` to before `end`, fewer only at the end of the file. */
   read(start: number, end: number, options?: ReadOptions): Promise<Uint8Array>;
   close(): void;
 }
+
+/** Whether a source has a chunk that ends at `end`, as far as is known. */
+export const reaches = (source: Source, end: number): boolean =>
+  source.reaches?.(end) ?? (source.size === null || end <= source.size);
 
 /** A file that the page has: chosen by its user, or dropped. */
 export class BlobSource implements Source {
