@@ -9,7 +9,7 @@ entry. This module does not know what a scene is: a chunk is a kind, a position 
 import struct
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -61,6 +61,7 @@ class Codec(IntEnum):
     OCCUPANCY = 5  # the occupancy grid
     WEIGHTS = 6  # weights of a decoder
     POSES = 7  # cameras
+    SHARED = 8  # plane segments in a group: nothing, since a shared plane beside the groups is meant
 
 
 @dataclass(frozen=True)
@@ -136,6 +137,21 @@ class Chunk:
     codec: Codec = Codec.RAW
     encode: Callable[[], bytes] | None = field(default=None, compare=False)
     raw_length: int | None = None
+
+
+@dataclass(frozen=True)
+class Beside:
+    """A chunk that several groups of a clip share.
+
+    Attributes:
+        chunk: its number in the index of the clip.
+        name: for messages.
+        is_there: whether all its bytes are.
+    """
+
+    chunk: int
+    name: str
+    is_there: bool
 
 
 @dataclass(frozen=True)
@@ -281,6 +297,9 @@ class Reader:
     Attributes:
         header, index: verified.
         name: of the file, for messages.
+        beside: the chunks that are planes which groups of a clip share, by number; those of a group lie beside it
+            (`kpc.format.container.shared_planes`).
+        kept_bytes: bytes of memory that such planes take at most, for all readers of the file together.
 
     Raises:
         FormatError: not a .kpc file, a draft or another version, damaged, or claiming more than its size allows.
@@ -290,16 +309,19 @@ class Reader:
     name: str
     header: Header
     index: tuple[Entry, ...]
+    beside: Mapping[int, Beside]
+    kept_bytes: int
     _reading: threading.Lock
 
     def __init__(self, source: "AnySource | Reader", *, allow_partial: bool = False):
         if isinstance(source, Reader):
             self._reading = source._reading
             self.source, self.name, self.header, self.index = source.source, source.name, source.header, source.index
+            self.beside, self.kept_bytes = source.beside, source.kept_bytes
             return
         self._reading = threading.Lock()
         self.source = open_source(source)
-        self.name = self.source.name
+        self.name, self.beside, self.kept_bytes = self.source.name, {}, 0
         self.header = self._read_header(allow_partial)
         self.index = self._read_index()
 
@@ -385,6 +407,8 @@ class Reader:
 
     def available(self, number: int) -> bool:
         """Return whether all bytes of a chunk are there; False only in a partial file."""
+        if number in self.beside:
+            return self.beside[number].is_there
         entry = self.index[number]
         return entry.offset + entry.stored_length <= self.source.size
 
@@ -396,15 +420,20 @@ class Reader:
         with self._reading:
             body = self.source.read_at(entry.offset, entry.stored_length)
         if len(body) != entry.stored_length:
-            cut_off = self._cut_off(self.header)
-            raise FormatError(f"{cut_off}: chunk {number} ({entry.kind}) is not there; fetch the file again")
+            where = self.name if number in self.beside else self._cut_off(self.header)
+            raise FormatError(f"{where}: {self._named(number)} is not there; fetch the file again")
         if google_crc32c.value(body) != entry.crc:
             is_remote = isinstance(self.source, RemoteSource)
             remedy = (
                 "open it again, since it may have been replaced on the server" if is_remote else "fetch the file again"
             )
-            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) is damaged (its CRC32C differs); {remedy}")
+            raise FormatError(f"{self.name}: {self._named(number)} is damaged (its CRC32C differs); {remedy}")
         return body
+
+    def _named(self, number: int) -> str:
+        """Return what a chunk is called in messages."""
+        named = f"chunk {number} ({self.index[number].kind})"
+        return f"{named}, {self.beside[number].name}," if number in self.beside else named
 
     def chunk(self, number: int, limit: int | None = None) -> bytes:
         """Return the content of a chunk under RAW or ZSTD, verified and decoded.

@@ -3,6 +3,9 @@
 
     GRUP chunk    a whole .kpc file: one group. Its index entry says which frames of the clip the group covers.
 
+Planes that groups store alike lie beside them (`kpc.format.container.shared_planes`), and are read as if they lay in
+each of these groups.
+
 Each group has planes, occupancy, motion grid and decoder of its own and is encoded, fetched and released like any
 scene. Encoding and playing therefore take the memory of one or two groups, however long the clip. Over frames that two
 groups share the picture is blended from one to the other, since a hard switch between their different errors would be
@@ -13,10 +16,8 @@ visible.
     scene = read(groups.open(number)).dequantise()
 """
 
-import itertools
 import os
-from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -28,94 +29,14 @@ from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.container import ENTRY, HEADER, Codec, Entry, Reader, header_and_index, stored_frame
 from kpc.format.container.metadata_chunk import META_LIMIT, pack_metadata, parse_metadata
 from kpc.format.container.scene_io import SceneReader, read
-from kpc.format.container.scene_layout import FRAME_LIMIT, GROUP_KIND
+from kpc.format.container.scene_layout import GROUP_KIND, PLANE_KIND
+from kpc.format.container.shared_planes import SharedPlanes, put_back, stored_alike, without_shared
 from kpc.format.container.slices import sliced
 from kpc.format.container.sources import AnySource, RemoteSource, Source, open_source
+from kpc.format.container.timeline import Span, Timeline, check_spans
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.metadata import Metadata, merged
 from kpc.format.scene.scene import Clip, Scene
-
-
-@dataclass(frozen=True)
-class Span:
-    """The frames `start` to `last` of a clip, `count` of them."""
-
-    start: int
-    count: int
-
-    @property
-    def last(self) -> int:
-        """The last frame, inclusive."""
-        return self.start + self.count - 1
-
-
-@dataclass(frozen=True)
-class Timeline:
-    """Which frames of a clip each of its groups covers.
-
-    Neighbouring groups share frames, or one begins right after the other ends.
-
-    Attributes:
-        spans: the frames of each group, in order; the clip begins with the first frame of the first group.
-        fps: frames per second.
-    """
-
-    spans: tuple[Span, ...]
-    fps: float
-
-    @property
-    def clip(self) -> Clip:
-        """The time axis of the whole clip."""
-        return Clip(self.spans[-1].last - self.spans[0].start + 1, self.fps)
-
-    def at(self, time: float) -> tuple[int, float]:
-        """Return the group shown at `time` in [0, 1] over the clip, and the time in [0, 1] within that group.
-
-        A group takes over in the middle between its first frame and the last frame of the group before it.
-        """
-        frame = self.spans[0].start + time * (self.clip.frame_count - 1)
-        number = bisect_right(self._switch_frames, frame)
-        return number, self.local_time(number, time)
-
-    def blend_at(self, time: float) -> list[tuple[int, float, float]]:
-        """Return the (group, time in it, weight) triples blended at `time` in [0, 1] over the clip.
-
-        There are two of them between shared frames, else one. The weight of the later group grows linearly from 0 at
-        the first shared frame to 1 at the last.
-        """
-        number, local_time = self.at(time)
-        frame = self.spans[0].start + time * (self.clip.frame_count - 1)
-        for later in range(max(number, 1), min(number + 2, len(self.spans))):
-            first, last = self.spans[later].start, self.spans[later - 1].last
-            if first < frame < last:
-                share = (frame - first) / (last - first)
-                return [
-                    (later - 1, self.local_time(later - 1, time), 1 - share),
-                    (later, self.local_time(later, time), share),
-                ]
-        return [(number, local_time, 1.0)]
-
-    def local_time(self, number: int, time: float) -> float:
-        """Return the time in [0, 1] within a group at a time of the clip, clamped to the frames of the group."""
-        span, frame = self.spans[number], self.spans[0].start + time * (self.clip.frame_count - 1)
-        return min(max((frame - span.start) / (span.count - 1), 0.0), 1.0) if span.count > 1 else 0.0
-
-    def clip_time(self, number: int, local_time: float) -> float:
-        """Return the time of the clip at a time in [0, 1] within a group: the inverse of `local_time`."""
-        span = self.spans[number]
-        frame = span.start + local_time * (span.count - 1) - self.spans[0].start
-        return min(max(frame / max(self.clip.frame_count - 1, 1), 0.0), 1.0)
-
-    def display_span(self, number: int) -> tuple[float, float]:
-        """Return from when to when a group is the one shown, in [0, 1] over the clip."""
-        frames, start = max(self.clip.frame_count - 1, 1), self.spans[0].start
-        ends = [0.0, *((frame - start) / frames for frame in self._switch_frames), 1.0]
-        return ends[number], ends[number + 1]
-
-    @cached_property
-    def _switch_frames(self) -> list[float]:
-        """The frame of the clip at which each group but the first takes over."""
-        return [(before.last + after.start) / 2 for before, after in itertools.pairwise(self.spans)]
 
 
 class Groups:
@@ -151,6 +72,7 @@ class Groups:
         source = open_source(source, limit=memory_budget)
         self.reader = Reader(source, allow_partial=allow_partial)
         self.name, self._budget, self._in_parts = self.reader.name, memory_budget, in_parts
+        self._shared: SharedPlanes | None = None
         self._chunks = [number for number, entry in enumerate(self.reader.index) if entry.kind == GROUP_KIND]
         self.is_single = not self._chunks
         if self.is_single:
@@ -163,6 +85,7 @@ class Groups:
                 # Groups are read concurrently, but such a server sends everything in one response.
                 self.reader.source = open_source(source.read_at(0, source.size))
             spans = self._spans()
+            self._shared = SharedPlanes(self.reader, len(spans), memory_budget)
             self._first = self._opened(0, self._slice(0, self.reader.source))
         if reads_metadata:
             _ = self._beside
@@ -186,7 +109,12 @@ class Groups:
 
     def available(self, number: int) -> bool:
         """Return whether a group is complete; False only in a partial file."""
-        return self.is_single or self.reader.available(self._chunks[number])
+        if self._shared is None:
+            return True
+        if not self.reader.available(self._chunks[number]) or self._shared.are_there(number):
+            return self.reader.available(self._chunks[number])
+        reader = self._reader(number, self._slice(number, self.reader.source))
+        return all(plane.is_there for plane in reader.beside.values())
 
     def open(self, number: int, apart: bool = False) -> SceneReader:
         """Open the scene of a group.
@@ -205,11 +133,22 @@ class Groups:
         return scene
 
     def source_of(self, number: int) -> Source:
-        """Return the bytes of a group as a source that another thread can read beside other groups."""
+        """Return the bytes of a group as a source that another thread can read beside other groups. Planes that it
+        shares are not among them, see `whole`.
+        """
         source = self.reader.source
         if isinstance(source, RemoteSource) and source.has_ranges:
             source = source.clone()
         return source if self.is_single else self._slice(number, source)
+
+    def whole(self, number: int) -> Source:
+        """Return a group as a file of its own, in which the planes lie that it shares.
+
+        Raises:
+            FormatError: as `SceneReader`, or a plane that it shares is not in the file.
+        """
+        source = self.source_of(number)
+        return source if self._shared is None else put_back(self._reader(number, source))
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras of the first group, which stand for all."""
@@ -239,7 +178,7 @@ class Groups:
         """Sort the groups by number and return their frames, after checking them."""
         entries = self.reader.index
         for number, entry in enumerate(entries):
-            if entry.is_critical and entry.kind != GROUP_KIND:
+            if entry.is_critical and entry.kind not in (GROUP_KIND, PLANE_KIND):
                 raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) lies outside the groups; update kpc")
             if entry.kind == GROUP_KIND and (
                 entry.codec != Codec.RAW
@@ -261,13 +200,21 @@ class Groups:
 
     def _slice(self, number: int, source: Source) -> Source:
         entry = self.reader.index[self._chunks[number]]
-        return sliced(source, entry.offset, entry.stored_length, f"{self.name}, group {number}")
+        return sliced(source, entry.offset, entry.stored_length, f"{self.name}, group {number}", self._shared)
 
     def _opened(self, number: int, source: Source) -> SceneReader:
-        is_partial = not self.available(number)
+        reader = self._reader(number, source)
+        return SceneReader(reader, memory_budget=self._budget, in_parts=self._in_parts)
+
+    def _reader(self, number: int, source: Source) -> Reader:
+        """Return a reader of a group, with the planes that it shares in their places."""
+        is_partial = not self.reader.available(self._chunks[number])
         if is_partial and source.size < HEADER.size:
             raise FormatError(f"{self.reader.cut_off}: group {number} is not there; fetch the file again")
-        return SceneReader(source, memory_budget=self._budget, allow_partial=is_partial, in_parts=self._in_parts)
+        reader = Reader(source, allow_partial=is_partial)
+        if self._shared is not None:
+            self._shared.resolve(reader, number)
+        return reader
 
     def _check(self, number: int, scene: SceneReader) -> None:
         clip, span = scene.head.clip, self.timeline.spans[number]
@@ -380,7 +327,7 @@ def group_inputs(files: Sequence[AnySource]) -> list[GroupInput]:
             parts.append(GroupInput.of(groups.reader.source, start))
         else:
             parts += [
-                GroupInput.of(groups.source_of(number), start + span.start, groups.metadata())
+                GroupInput.of(groups.whole(number), start + span.start, groups.metadata())
                 for number, span in enumerate(spans)
             ]
     return parts
@@ -401,7 +348,8 @@ def check_parts(parts: Sequence[GroupInput]) -> None:
 def write(parts: Sequence[GroupInput], path: str | os.PathLike[str], metadata: Metadata | None = None) -> int:
     """Write a clip in groups and return its size in bytes.
 
-    One group is in memory at a time. On failure an existing file at `path` is left unchanged.
+    Planes that groups next to each other store alike are stored once, before the first of these groups. One group is in
+    memory at a time. On failure an existing file at `path` is left unchanged.
 
     Args:
         parts: the groups, in order.
@@ -421,17 +369,23 @@ def write(parts: Sequence[GroupInput], path: str | os.PathLike[str], metadata: M
         )
     metadata = merged([part.metadata for part in parts]) if metadata is None else metadata
     beside = [pack_metadata(metadata)] if metadata else []
+    readers = [Reader(part.source) for part in parts]
+    shared = stored_alike(readers)
+    planes = [[chunk for chunk, first in chunks.items() if first == number] for number, chunks in enumerate(shared)]
+    count = len(parts) + len(beside) + sum(map(len, planes))
     entries: list[Entry] = []
     with atomic_write(path) as temporary, temporary.open("wb") as opened:
         # Header and index come first but hold checksums of the groups, so they are written last.
-        opened.seek(HEADER.size + len(stored_frame(bytes(ENTRY.size * (len(parts) + len(beside))))))
+        opened.seek(HEADER.size + len(stored_frame(bytes(ENTRY.size * count))))
         for body in beside:  # before the groups, so that it comes with the first request
             opened.write(body)
             crc, size = google_crc32c.value(body), len(body)
             entries.append(Entry("meta", 0, 0, 0, 0, 0, Codec.RAW, size, size, crc))
-        for number, part in enumerate(parts):
-            _check_whole(part.source)
-            body, span = part.source.read_at(0, part.source.size), part.span
+        for number, (part, reader) in enumerate(zip(parts, readers, strict=True)):
+            for chunk in sorted(planes[number]):
+                opened.write(reader.stored(chunk))
+                entries.append(replace(reader.index[chunk], group=number))
+            body, span = _body(reader, shared[number]), part.span
             opened.write(body)
             crc, size = google_crc32c.value(body), len(body)
             entries.append(Entry(GROUP_KIND, number, 0, 0, span.start, span.count, Codec.RAW, size, size, crc))
@@ -441,13 +395,25 @@ def write(parts: Sequence[GroupInput], path: str | os.PathLike[str], metadata: M
     return size_bytes
 
 
-def _check_whole(source: Source) -> None:
-    """Check the CRC32C of every chunk, since that of the group that a file becomes would vouch for its damage.
+def _body(reader: Reader, shared: Mapping[int, int]) -> bytes:
+    """Return the file that becomes a group, without the chunks that are shared. The CRC32C of every chunk is checked,
+    since that of the group would vouch for its damage.
 
     Raises:
         FormatError: one differs.
     """
-    reader = Reader(source)
+    if shared:
+        return without_shared(reader, shared)
+    _check_all(reader)
+    return reader.source.read_at(0, reader.source.size)
+
+
+def _check_all(reader: Reader) -> None:
+    """Check the CRC32C of every chunk.
+
+    Raises:
+        FormatError: one differs.
+    """
     for number in range(len(reader.index)):
         reader.stored(number)
 
@@ -459,36 +425,6 @@ def check_checksums(groups: Groups) -> None:
         FormatError: one differs, or the file is cut off.
     """
     for number in range(len(groups)):
-        _check_whole(groups.source_of(number))
+        _check_all(Reader(groups.source_of(number)))
     if not groups.is_single:
-        _check_whole(groups.reader.source)
-
-
-def check_spans(spans: Sequence[Span], names: str | Sequence[str]) -> None:
-    """Check that the frames of groups make up a clip.
-
-    Each group must begin and end later than the one before, without a gap, and no frame may be in more than two groups.
-
-    Args:
-        spans: the frames of each group.
-        names: of the file, or of one file per group, for messages.
-
-    Raises:
-        FormatError: they do not, or there are more than FRAME_LIMIT frames.
-    """
-    labels = [f"{names}: group {k}" for k in range(len(spans))] if isinstance(names, str) else names
-    for number, (before, after) in enumerate(itertools.pairwise(spans)):
-        if not before.start < after.start <= before.last + 1 or not before.last < after.last:
-            one, other = labels[number : number + 2]
-            raise FormatError(
-                f"{one} holds frames {before.start} to {before.last}, {other} frames {after.start} to {after.last}: "
-                "each must begin and end later than the one before, and leave no frame out; join them again"
-            )
-    for number, (before, after) in enumerate(zip(spans, spans[2:], strict=False)):
-        if after.start <= before.last:
-            raise FormatError(
-                f"{labels[number + 2]} begins with frame {after.start}, which two groups before it hold: "
-                "a frame may be in two groups at most"
-            )
-    if (frames := spans[-1].last - spans[0].start + 1) > FRAME_LIMIT:
-        raise FormatError(f"{labels[-1]}: {frames:,} frames exceed the limit of {FRAME_LIMIT:,}; split the clip")
+        _check_all(groups.reader)

@@ -9,13 +9,14 @@ Missing space planes have the value 0, missing rows of time planes the value 1; 
 """
 
 from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import cast
 
 import numpy as np
 
 from kpc.format.coding.quantise import dequantise_symbols
-from kpc.format.container.container import Entry, Reader
+from kpc.format.container.container import Entry
+from kpc.format.container.runs import adjacent_runs, announce
 from kpc.format.container.scene_io import SceneReader
 from kpc.format.container.scene_layout import KNOWN_KINDS, PlaneHead
 from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, Scene
@@ -167,27 +168,6 @@ class PartialScene:
 
     def _segmented(self, entry: Entry) -> SegmentedPlane:
         return cast(SegmentedPlane, self._planes[entry.scale][ALL_PLANES[entry.plane]])
-
-
-def adjacent_runs(index: Sequence[Entry], numbers: Iterable[int], most_bytes: float = float("inf")) -> list[list[int]]:
-    """Split chunks, in the order given, into runs that are adjacent in the file and at most `most_bytes` long."""
-    found: list[list[int]] = []
-    end = size = 0
-    for number in numbers:
-        entry = index[number]
-        if found and entry.offset == end and size + entry.stored_length <= most_bytes:
-            found[-1].append(number)
-        else:
-            found.append([number])
-            size = 0
-        end, size = entry.offset + entry.stored_length, size + entry.stored_length
-    return found
-
-
-def announce(reader: Reader, run: Sequence[int]) -> None:
-    """Announce to the source that a run of adjacent chunks will be read in order."""
-    start, last = reader.index[run[0]].offset, reader.index[run[-1]]
-    reader.source.will_read(start, last.offset + last.stored_length - start)
 
 
 def _missing_plane(plane: PlaneHead) -> np.ndarray:

@@ -54,6 +54,7 @@ FRAME_TOLERANCE = 1e-4  # of the products of the axes of a frame, which should b
 # Magnitude of a corner of the box or of a camera's numbers, in world units; 1 over it bounds the box's edges below.
 BOX_LIMIT = 1 << 30
 
+PLANE_KIND = "PLNE"  # a segment of a plane, or beside groups a plane that they share
 GROUP_KIND = "GRUP"  # a scene's file in a file of several, `kpc.format.container.groups`
 KNOWN_KINDS = frozenset({"SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "meta", "soun", "PLNE"})
 HEAD_LIMIT = SCENE_STRUCT.size + SCALE_LIMIT * (SCALE_STRUCT.size + 9 * 4 * CHANNEL_LIMIT)  # bytes of SCNE, at most

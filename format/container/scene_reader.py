@@ -16,6 +16,7 @@ from kpc.format.common.errors import BudgetError, FormatError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.container import Codec, Entry, Reader
 from kpc.format.container.metadata_chunk import META_LIMIT, parse_metadata
+from kpc.format.container.runs import adjacent_runs, announce
 from kpc.format.container.scene_layout import (
     APPEARANCE_LIMIT,
     APPEARANCE_STRUCT,
@@ -29,6 +30,7 @@ from kpc.format.container.scene_layout import (
     KNOWN_KINDS,
     NAME_LIMIT,
     NDC_STRUCT,
+    PLANE_KIND,
     Cursor,
     WeightsParser,
     parse_appearances,
@@ -52,7 +54,7 @@ from kpc.format.container.segments import (
     side_info_of,
 )
 from kpc.format.container.sound_chunk import SOUND_LIMIT, SoundSegment, parse_sound, sound_chunks, sound_of
-from kpc.format.container.sources import AnySource, open_source
+from kpc.format.container.sources import AnySource, RemoteSource, open_source
 from kpc.format.core.decoding import decode_segment, implied_rows
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.metadata import Metadata
@@ -87,6 +89,8 @@ def read(
         BudgetError: it needs more than `memory_budget`; raised before the memory is taken.
     """
     reader = SceneReader(source, memory_budget=memory_budget, allow_partial=allow_partial)
+    if isinstance(reader.source, RemoteSource):
+        _fetch_shared(reader)
     reader.source.will_read(0, reader.source.size)
     scales = _read_planes(reader)
     for number, entry in enumerate(reader.index):
@@ -108,6 +112,14 @@ def read(
         reader.metadata(),
         reader.sound(),
     )
+
+
+def _fetch_shared(reader: "SceneReader") -> None:
+    """Fetch planes that the groups of a clip share, unless another group has, neighbours with one request."""
+    for run in adjacent_runs(reader.index, filter(reader.available, reader.beside)):
+        announce(reader, run)
+        for number in run:
+            reader.stored(number)
 
 
 def _read_planes(reader: "SceneReader") -> tuple[dict[str, QuantisedPlane], ...]:
@@ -189,7 +201,7 @@ class SceneReader(Reader):
                 f"{self.name}: the header claims {self.header.value_count:,} values, "
                 f"the scene {self.head.value_count:,}"
             )
-        self._other_bytes: dict[str, int] = {}
+        self._other_bytes = {"planes that groups share": self.kept_bytes}
         self._projections: dict[str, np.ndarray] = {}
         self.planes_bytes = 0 if in_parts else 5 * self.head.value_count  # one int8 symbol and one float32 each
         if self.planes_bytes > memory_budget:
@@ -376,6 +388,12 @@ class SceneReader(Reader):
             raise FormatError(f"{self.name}: {error}") from error
 
     def _check_kinds(self) -> None:
+        for number, entry in enumerate(self.index):
+            if entry.kind == PLANE_KIND and entry.codec == Codec.SHARED:
+                raise FormatError(
+                    f"{self.name}: chunk {number} (PLNE) stands for a shared plane, which a group of a clip alone has; "
+                    "encode it again"
+                )
         if any(entry.kind == GROUP_KIND for entry in self.index):
             raise FormatError(f"{self.name}: a clip in groups, where a single scene is wanted")
         for number, entry in enumerate(self.index):

@@ -107,7 +107,9 @@ def _write_pages(files: Sequence[str], folder: Path, memory: int | None) -> dict
             address, hosts = file, f" {urlsplit(file).scheme}://{urlsplit(file).netloc}"
         else:
             elsewhere[f"/{prefix}{address}"] = Path(file).absolute()
-        scene = SharedScene(address, name, groups.metadata(), groups.clip, sum(groups.size_bytes), has_poster=False)
+        scene = SharedScene(
+            address, name, groups.metadata(), groups.clip, groups.reader.header.file_length, has_poster=False
+        )
         (folder / prefix).mkdir(exist_ok=True)
         page = site.scene_page(scene, root="../" if is_gallery else "", hosts=hosts, memory=memory)
         site.write_file(folder / prefix / site.PAGE, page)

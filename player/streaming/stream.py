@@ -23,7 +23,8 @@ from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, 
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.common.text import byte_text
 from kpc.format.container.container import Reader
-from kpc.format.container.partial import PartialScene, adjacent_runs, announce
+from kpc.format.container.partial import PartialScene
+from kpc.format.container.runs import adjacent_runs, announce
 from kpc.format.container.scene_io import SceneReader
 from kpc.format.container.sources import RemoteSource, Source
 from kpc.format.scene.scene import ALL_PLANES, Scene
@@ -250,7 +251,7 @@ class Stream:
         """Bytes that the scene takes besides segments of time planes.
 
         They are those of the renderer without pictures, of occupancy and motion, of planes that wait to be uploaded and
-        one that is being decoded, of the source, and of sound.
+        one that is being decoded, of the source, of planes that groups share, and of sound.
         """
         scene, layout = self.scene, self._layout
         largest = max(layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
@@ -261,7 +262,8 @@ class Stream:
             self.source.size if whole else 2 * (RUN_BYTES + max(entry.stored_length for entry in self._reader.index))
         )
         sound = SOUND_BYTES if self.has_sound else 0
-        return Renderer.bytes_for(scene) + scene.occupancy.nbytes + motion + decoding + source + sound
+        kept = self._reader.kept_bytes
+        return Renderer.bytes_for(scene) + scene.occupancy.nbytes + motion + decoding + source + kept + sound
 
     @property
     def has_sound(self) -> bool:

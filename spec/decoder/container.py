@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import zstandard
 
-from .common import Refused, crc32c, require
+from .common import PLANES, Refused, crc32c, require
 
-RAW, ZSTD, PREDICTIVE, TRANSFORM, MOTION, OCCUPANCY, WEIGHTS, POSES = range(8)
+RAW, ZSTD, PREDICTIVE, TRANSFORM, MOTION, OCCUPANCY, WEIGHTS, POSES, SHARED = range(9)
 CODECS = {  # beside RAW and ZSTD
-    b"PLNE": (PREDICTIVE, TRANSFORM),
+    b"PLNE": (PREDICTIVE, TRANSFORM, SHARED),
     b"MOVE": (MOTION,),
     b"OCCU": (OCCUPANCY,),
     b"DECO": (WEIGHTS,),
@@ -22,7 +22,7 @@ CODECS = {  # beside RAW and ZSTD
     b"soun": (),
 }
 HEADER, ENTRY = struct.Struct("<8sHHIIIQQII"), struct.Struct("<4sHBBIIHIII")
-EXPANSION_LIMIT = 32768
+EXPANSION_LIMIT, SCALE_LIMIT = 32768, 16
 
 
 @dataclass
@@ -107,8 +107,10 @@ def decompress(frame, length):  # section 4.5
     return content
 
 
-def scene_contents(data, is_prefix):  # sections 4.3 and 4.4
-    """Return (list of (chunk, content), value_count) of a scene; the content is None where a prefix lacks it."""
+def scene_contents(data, is_prefix, shared=None):  # sections 4.3 and 4.4
+    """Return (list of (chunk, content), value_count) of a scene; the content is None where a prefix lacks it.
+
+    shared: of a group, the shared planes that it may use, by scale and plane."""
     chunks, value_count = read_chunks(data, is_prefix)
     contents = []
     for chunk in chunks:
@@ -119,6 +121,9 @@ def scene_contents(data, is_prefix):  # sections 4.3 and 4.4
         has_position = chunk.kind in (b"PLNE", b"soun")
         require(chunk.group == 0 and (has_position or not any(position)), "invalid fields of an index entry")
         require(chunk.codec in (RAW, ZSTD, *CODECS[chunk.kind]), "unknown codec")
+        if chunk.codec == SHARED:
+            require(shared is not None, "a shared plane is not in a group")
+            chunk = shared_plane(chunk, shared)
         require(chunk.codec != RAW or chunk.raw_length == chunk.stored_length, "invalid raw length")
         require(chunk.codec <= ZSTD or chunk.raw_length <= EXPANSION_LIMIT * chunk.stored_length, "invalid raw length")
         contents.append((chunk, plain_content(chunk) if chunk.is_whole else None))
@@ -131,20 +136,46 @@ def plain_content(chunk):
     return Content(chunk.codec, chunk.raw_length, stored)
 
 
+def shared_plane(chunk, shared):  # section 4.7
+    """Return the shared plane that a SHARED chunk of a group stands for."""
+    require(chunk.row_start == chunk.stored_length == chunk.crc == 0, "a SHARED chunk has bytes or a first row")
+    require((chunk.scale, chunk.plane) in shared, "there is no such shared plane")
+    found = shared[chunk.scale, chunk.plane]
+    sizes = found.row_count, found.raw_length
+    require((chunk.row_count, chunk.raw_length) == sizes, "a shared plane has another size")
+    return found
+
+
 def group_chunks(data, is_prefix=False):  # section 4.7
-    """Return (the GRUP chunks by rising number, the meta chunks beside them, value_count); no chunks of a scene."""
+    """Return (the GRUP chunks by rising number, the meta chunks beside them, the shared planes, value_count); no chunks
+    of a scene."""
     chunks, value_count = read_chunks(data, is_prefix)
-    groups, beside = {}, []
+    groups, beside, shared = {}, [], []
     if any(chunk.kind == b"GRUP" for chunk in chunks):
         for chunk in chunks:
-            require(chunk.kind == b"GRUP" or not chunk.is_critical, "a critical chunk lies beside groups")
+            is_known = chunk.kind in (b"GRUP", b"PLNE")
+            require(is_known or not chunk.is_critical, "a critical chunk lies beside groups")
             if chunk.kind == b"GRUP":
                 require(chunk.codec == RAW and chunk.raw_length == chunk.stored_length, "invalid codec of a group")
                 require(chunk.scale == chunk.plane == 0 and chunk.row_count > 0, "invalid fields of a group")
                 require(chunk.group not in groups, "invalid number of a group")
                 groups[chunk.group] = chunk
+            elif chunk.kind == b"PLNE":
+                require(chunk.codec in (RAW, ZSTD, PREDICTIVE, TRANSFORM), "invalid codec of a shared plane")
+                is_plane = chunk.scale < SCALE_LIMIT and chunk.plane < len(PLANES)
+                require(is_plane and chunk.row_start == 0 and chunk.row_count > 0, "invalid fields of a shared plane")
+                shared.append(chunk)
             elif chunk.kind == b"meta":
                 require(chunk.codec in (RAW, ZSTD), "unknown codec")
                 beside.append(chunk)
     require(sorted(groups) == list(range(len(groups))), "invalid numbers of groups")
-    return [groups[number] for number in range(len(groups))], beside, value_count
+    require(all(chunk.group < len(groups) for chunk in shared), "a shared plane is for no group")
+    places = {(chunk.group, chunk.scale, chunk.plane) for chunk in shared}
+    require(len(places) == len(shared), "a shared plane is there twice")
+    return [groups[number] for number in range(len(groups))], beside, shared, value_count
+
+
+def shared_planes_of(group, shared):
+    """Return {(scale, plane): the shared plane that SHARED chunks of a group stand for}."""
+    usable = sorted((chunk for chunk in shared if chunk.group <= group), key=lambda chunk: chunk.group)
+    return {(chunk.scale, chunk.plane): chunk for chunk in usable}  # of those of one place, the last stays

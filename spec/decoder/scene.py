@@ -21,9 +21,9 @@ from .sound import decode_sound
 SINGLE_KINDS = "SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "meta"
 
 
-def decode(data, is_prefix=False):
-    """Return the scene as a dict of numbers, lists and dicts."""
-    chunks, value_count = scene_contents(data, is_prefix)
+def decode(data, is_prefix=False, shared=None):
+    """Return the scene as a dict of numbers, lists and dicts; shared: see scene_contents."""
+    chunks, value_count = scene_contents(data, is_prefix, shared)
     single, segments, sound = {}, [], []
     for chunk, content in chunks:
         kind = chunk.kind.decode()

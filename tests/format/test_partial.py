@@ -6,7 +6,8 @@ import pytest
 
 from kpc.format.common.errors import BudgetError
 from kpc.format.container.container import Reader
-from kpc.format.container.partial import PartialScene, SegmentedPlane, adjacent_runs
+from kpc.format.container.partial import PartialScene, SegmentedPlane
+from kpc.format.container.runs import adjacent_runs
 from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import TIME_PLANES, Scene

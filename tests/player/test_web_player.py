@@ -21,8 +21,6 @@ import kpc
 from kpc.encoder.coding.opus import encode_sound
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.images import linear_from_srgb, srgb_from_linear
-from kpc.format.container import groups
-from kpc.format.container.groups import GroupInput
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
@@ -32,6 +30,7 @@ from kpc.player.cpu.reference import render, render_rays
 from kpc.player.sharing.file_server import Handler, Link, serving
 from kpc.player.viewpoints import presets
 from kpc.tools.bench import web_page
+from kpc.tools.vectors.group_vectors import packed
 from sounds import decoded, sweep, write_clip_with_sound
 
 SAMPLE = Path(__file__).parent.parent.parent / "samples" / "default.kpc"
@@ -112,7 +111,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         (folder / file.name).write_bytes(file.read_bytes())
     (folder / "scene.kpc").write_bytes(data)
     for name, count in ("long.kpc", 3), ("other.kpc", 4):
-        groups.write([GroupInput.of(data, 30 * number) for number in range(count)], folder / name)
+        # Each group has planes of its own, so that they are still to be fetched while the first one plays.
+        (folder / name).write_bytes(packed([(30 * number, 30, data) for number in range(count)]))
     write_clip_with_sound(folder / "sound.kpc", RECORDING)
     (folder / "text.kpc").write_text("<!doctype html><title>Not here</title>" * 9)
     (folder / "draft.kpc").write_bytes(data[:10] + bytes(2) + data[12:])

@@ -226,7 +226,7 @@ def in_content(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> byt
     else:
         body = scrambled(rng, body)
         if rng.random() < 0.1:
-            entry = replace(entry, raw_length=rng.choice(WHOLES), codec=rng.randrange(9))
+            entry = replace(entry, raw_length=rng.choice(WHOLES), codec=rng.randrange(len(Codec) + 1))
     pieces[number] = Piece(entry, body)
     return replace(taken, pieces=tuple(pieces)).together()
 

@@ -1,15 +1,15 @@
 """The conformance vectors of clips in groups, made of other vectors."""
 
-import struct
 from collections.abc import Sequence
 from typing import Any
 
-import google_crc32c
-
-from kpc.format.container.container import Entry, Reader, header_and_index
+from kpc.format.container.container import Reader
 from kpc.format.container.groups import Groups
-from kpc.tools.vectors.files import HEADER_FIELDS, sealed, with_entry
+from kpc.format.container.scene_layout import GROUP_KIND
+from kpc.tools.vectors import shared_vectors
+from kpc.tools.vectors.files import sealed, with_entry
 from kpc.tools.vectors.metadata_vectors import MINIMAL
+from kpc.tools.vectors.shared_vectors import chunk, file_of, put_in
 
 TIMES = (0.0, 0.125, 0.3, 0.31, 0.32, 0.5, 0.6875, 1.0)
 
@@ -26,19 +26,8 @@ def packed(
     groups: Sequence[Group], *, beside: Sequence[tuple[str, bytes]] = (), value_count: int | None = None
 ) -> bytes:
     """Return a file of groups, whether they make up a clip or not, with chunks of other kinds after them."""
-    bodies = [body for *_, body in groups] + [body for _, body in beside]
-    places = [("GRUP", number, start, count) for number, (start, count, _) in enumerate(groups)] + [
-        (kind, 0, 0, 0) for kind, _ in beside
-    ]
-    entries = [
-        Entry(kind, number, 0, 0, start, count, 0, len(body), len(body), google_crc32c.value(body))
-        for (kind, number, start, count), body in zip(places, bodies, strict=True)
-    ]
-    most = value_count
-    if most is None:
-        offset, layout = HEADER_FIELDS["value_count"]
-        most = max(struct.unpack_from(layout, body, offset)[0] for *_, body in groups)
-    return header_and_index(entries, most, compress=False) + b"".join(bodies)
+    chunks = [chunk(GROUP_KIND, number, *group) for number, group in enumerate(groups)]
+    return file_of([*chunks, *(chunk(kind, 0, 0, 0, body) for kind, body in beside)], value_count)
 
 
 def valid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, bool]]:
@@ -53,7 +42,7 @@ def valid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, bool]]:
         "groups-metadata": (packed([(0, 12, third)], beside=[NOTE, ("meta", MINIMAL)]), False),
         "groups-one": (packed([(40, 12, third)]), False),
         "groups-prefix": (joined[: Reader(joined).index[1].offset + len(other) // 2], True),
-    }
+    } | shared_vectors.valid(scenes)
 
 
 def invalid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, str, str]]:
@@ -97,7 +86,7 @@ def invalid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, str, str]]:
             broken,
             "is damaged",
         ),
-    }
+    } | shared_vectors.invalid(scenes)
 
 
 def described(data: bytes, partial: bool, names: dict[bytes, str]) -> dict[str, Any]:
@@ -116,9 +105,9 @@ def described(data: bytes, partial: bool, names: dict[bytes, str]) -> dict[str, 
             {
                 "row_start": entry.row_start,
                 "row_count": entry.row_count,
-                "scene": names.get(data[entry.offset : entry.offset + entry.stored_length]),
+                "scene": names.get(put_in(groups.open(number))) if groups.available(number) else None,
             }
-            for entry in entries
+            for number, entry in enumerate(entries)
         ],
         "times": [
             {

@@ -244,6 +244,11 @@ def at_rest(scene: QuantisedScene) -> QuantisedScene:
     return map_planes(scene, still)
 
 
+def flat_zeros(scene: QuantisedScene) -> QuantisedScene:
+    """Return the scene with the symbol 0 in all texels."""
+    return map_planes(scene, lambda _, plane: replace(plane, symbols=0 * plane.symbols))
+
+
 def smooth(scene: QuantisedScene) -> QuantisedScene:
     """Return the scene with planes that compress well however large they are: they rise and fall slowly over all 8
     bits.

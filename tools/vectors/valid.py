@@ -42,6 +42,7 @@ from kpc.tools.vectors.files import (
 from kpc.tools.vectors.scenes import (
     at_rest,
     extreme_decoder,
+    flat_zeros,
     hybrid_decoder,
     jumping_motion,
     make_appearances,
@@ -53,6 +54,7 @@ from kpc.tools.vectors.scenes import (
     smooth,
     smooth_motion,
     with_few_cells,
+    with_occupancy,
 )
 
 Vector = tuple[bytes, bool]  # a file, and whether it is a prefix
@@ -140,6 +142,9 @@ def _planes(dynamic: QuantisedScene) -> dict[str, Vector]:
     slits = with_few_cells(make_scene(dynamic=True, sizes=[(2, 11, 8, 9, 6), (3, 20, 13, 17, 6)]))
     wide_slits = with_few_cells(make_scene(dynamic=True, sizes=[(2, 29, 21, 16, 5)]))
     fine = make_scene(dynamic=False, sizes=[(2, 20, 17, 9, 0)])
+    sides = [np.zeros((1, 3, 3, 5), bool) for _ in range(2)]
+    sides[0][..., 1] = sides[1][..., 3] = True
+    left, right = (flat_zeros(with_occupancy(make_scene(dynamic=False, sizes=[(1, 9, 6, 5, 0)]), one)) for one in sides)
     nothing = painted(lambda shape, seed: np.zeros(shape), coded=False)
     flat = painted(lambda shape, seed: noise(shape, seed) // 50)
     constant = painted(lambda shape, seed: np.full(shape, (127, -128, 1)[seed % 3]))
@@ -153,6 +158,9 @@ def _planes(dynamic: QuantisedScene) -> dict[str, Vector]:
         "predictive-empty": (predictive(nothing), False),
         "predictive-one-texel": (predictive(one_texel), False),
         "predictive-implied": (predictive(slits, 2, segment_rows=4, implied=True), False),
+        # Scenes whose planes have the same bytes and other maps.
+        "predictive-implied-left": (predictive(left, implied=True), False),
+        "predictive-implied-right": (predictive(right, implied=True), False),
         "predictive-time-empty": (predictive(at_rest(dynamic)), False),
         "trellis": (predictive(on_trellis(dynamic), 8, segment_rows=4), False),
         "trellis-extremes": (predictive(on_trellis(painted(extremes)), 4), False),
