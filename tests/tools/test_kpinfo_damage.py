@@ -58,7 +58,7 @@ def test_chunks_of_several_groups_and_beside_them(scene, tmp_path, capsys):
     path = tmp_path / "long.kpc"
     parts = [groups.GroupInput.of(scene, first) for first in (0, 22, 44)]
     groups.write(parts, path, Metadata({"title": "Dances"}))
-    whole, inner = path.read_bytes(), offsets(scene)
+    whole, inner = path.read_bytes(), offsets(groups.Groups(path).source_of(0))
     places = [entry.offset for entry in Reader(whole).index if entry.kind == "GRUP"]
     wrong = [places[0] + inner["soun"], places[1] + inner["SCNE"], places[2] + 9, offsets(whole)["meta"]]
     info, sums = verified(path, damaged(whole, *wrong), capsys)
@@ -69,3 +69,14 @@ def test_chunks_of_several_groups_and_beside_them(scene, tmp_path, capsys):
     info, _ = verified(path, damaged(whole, wrong[0]), capsys)
     assert info["metadata"] == {"title": "Dances"} and [one["kind"] for one in info["damaged_chunks"]] == ["soun"]
     assert kpinfo.main([str(path), "--verify", "--group", "2"]) == 0
+
+
+def test_a_damaged_plane_that_groups_share_is_named_once(scene, tmp_path, capsys):
+    path = tmp_path / "long.kpc"
+    groups.write([groups.GroupInput.of(scene, first) for first in (0, 22)], path)
+    (number, entry), *others = ((k, one) for k, one in enumerate(Reader(path).index) if one.kind == "PLNE")
+    info, _ = verified(path, damaged(path.read_bytes(), entry.offset), capsys)
+    assert info["damaged_chunks"] == [{"group": None, "chunk": number, "kind": "PLNE"}]
+    assert f"chunk {number} (PLNE), the shared plane xy of scale 0, is damaged" in info["error"]
+    listed = [(one["chunk"], one["first_group"], one["group_count"]) for one in info["shared_planes"]]
+    assert listed == [(number, 0, 2), *((other, 0, 2) for other, _ in others)]

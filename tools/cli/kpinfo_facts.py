@@ -3,7 +3,8 @@
 Shares are in [0, 1], times in seconds, sizes in bytes. What is not known is None.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -15,11 +16,12 @@ from kpc.format.common.errors import BudgetError, FormatError, KpcError, UsageEr
 from kpc.format.common.progress import in_parts, progress
 from kpc.format.common.text import counted
 from kpc.format.container.clip_sound import SoundSpan, sound_spans
-from kpc.format.container.container import Codec, Entry, Reader
+from kpc.format.container.container import Beside, Codec, Entry, Reader
 from kpc.format.container.groups import Groups
 from kpc.format.container.http_address import public_name
 from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.container.scene_layout import GROUP_KIND
+from kpc.format.container.shared_planes import SharedPlanes
 from kpc.format.container.slices import sliced
 from kpc.format.container.sources import open_source
 from kpc.format.scene.motion import QuantisedMotion
@@ -63,6 +65,7 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
         "cameras": None,
         "metadata": None,
         "groups": [],
+        "shared_planes": [],
     }
     with _noting(info):
         source = open_source(file, limit=memory)
@@ -105,8 +108,9 @@ def _noting(info: dict[str, Any]) -> Iterator[None]:
 
 def _describe_file(groups: Groups, info: dict[str, Any]) -> None:
     """Set what can be read without decoding planes."""
-    info["clip"] = _clip(groups.clip)
-    info["groups"] = [_group(groups, span, info) for span in sound_spans(groups.timeline)]
+    info["clip"], users = _clip(groups.clip), Counter[int]()
+    info["groups"] = [_group(groups, span, info, users) for span in sound_spans(groups.timeline)]
+    info["shared_planes"] = [_shared_plane(groups.reader, number, users[number]) for number in groups.reader.beside]
     info["clip"]["is_dynamic"] = any(one["is_dynamic"] for one in info["groups"])
     with _noting(info):
         info["cameras"] = len(groups.cameras())
@@ -136,10 +140,13 @@ def _clip(clip: Clip) -> dict[str, Any]:
     return {"frame_count": clip.frame_count, "fps": clip.fps, "duration_s": clip.total_s}
 
 
-def _group(groups: Groups, heard: SoundSpan, info: dict[str, Any]) -> dict[str, Any]:
+def _group(groups: Groups, heard: SoundSpan, info: dict[str, Any], users: Counter[int]) -> dict[str, Any]:
     """Return what header, index and SCNE of a group say, as far as they can be read; the first error goes to `info`.
 
     The group of a file without groups is the whole file.
+
+    Args:
+        users: how many groups use each shared plane; this one is counted.
     """
     number, clip = heard.group, groups.clip
     span = groups.timeline.spans[number]
@@ -149,8 +156,10 @@ def _group(groups: Groups, heard: SoundSpan, info: dict[str, Any]) -> dict[str, 
     head, sound = None, None
     if groups.available(number):
         with _noting(info):
-            head = groups.open(number).head
-            sound = _sound(groups.open(number), heard)
+            reader = groups.open(number)
+            head = reader.head
+            users.update(plane.chunk for plane in reader.beside.values())
+            sound = _sound(reader, heard)
     is_complete = head is not None and (not groups.is_single or groups.reader.source.size >= groups.size_bytes[0])
     return {
         "number": number,
@@ -198,18 +207,23 @@ def _verify(file: Reader, group: int | None, memory: int, info: dict[str, Any]) 
     file.source.will_read(0, file.source.size)
     chunks = [number for number, entry in enumerate(file.index) if entry.kind == GROUP_KIND]
     is_single = not chunks
+    shared = None if is_single else SharedPlanes(file, len(chunks), memory)
+    beside = [number for number, entry in enumerate(file.index) if entry.kind != GROUP_KIND]
+    damaged = [] if is_single else _differing(file, beside)
     if group is not None:
         chunks = [number for number in chunks if file.index[number].group == group]
     for chunk in progress([None] if is_single else chunks, "checking", unit="groups"):
         place = None if chunk is None else file.index[chunk].group
-        for number, kind, error in _damaged_chunks(file, memory) if chunk is None else _damaged_in(file, chunk, memory):
+        for number, kind, error in (
+            _damaged_chunks(file, memory)
+            if chunk is None
+            else _damaged_in(file, chunk, memory, shared, {number for number, *_ in damaged})
+        ):
             errors.append(error)
             found.append({"group": None if kind == GROUP_KIND else place, "chunk": number, "kind": kind})
-    if not is_single:
-        beside = [number for number, entry in enumerate(file.index) if entry.kind != GROUP_KIND]
-        for number, kind, error in _differing(file, beside):
-            errors.append(error)
-            found.append({"group": None, "chunk": number, "kind": kind})
+    for number, kind, error in damaged:
+        errors.append(error)
+        found.append({"group": None, "chunk": number, "kind": kind})
     if len(errors) > 1:
         named = [
             f"{one['chunk']} ({one['kind']})" + (f" of group {one['group']}" if one["group"] is not None else "")
@@ -221,12 +235,22 @@ def _verify(file: Reader, group: int | None, memory: int, info: dict[str, Any]) 
         raise errors[0]
 
 
-def _damaged_in(file: Reader, chunk: int, memory: int) -> list[tuple[int, str, FormatError]]:
-    """Return as `_damaged_chunks` does what is damaged in a GRUP chunk, or that chunk if it is damaged elsewhere."""
+def _damaged_in(
+    file: Reader, chunk: int, memory: int, shared: SharedPlanes | None, skipped: Collection[int]
+) -> list[tuple[int, str, FormatError]]:
+    """Return as `_damaged_chunks` does what is damaged in a GRUP chunk, or that chunk if it is damaged elsewhere.
+
+    Args:
+        shared: the planes that the groups of the file share.
+        skipped: the chunks of those that are known to be damaged.
+    """
     entry = file.index[chunk]
     try:
         name = f"{file.name}, group {entry.group}"
-        damaged = _damaged_chunks(Reader(sliced(file.source, entry.offset, entry.stored_length, name)), memory)
+        reader = Reader(sliced(file.source, entry.offset, entry.stored_length, name, shared))
+        if shared is not None:
+            shared.resolve(reader, entry.group)
+        damaged = _damaged_chunks(reader, memory, skipped)
     except FormatError:
         if found := _differing(file, [chunk]):
             return found
@@ -245,8 +269,9 @@ def _differing(file: Reader, numbers: Sequence[int] | None = None) -> list[tuple
     return damaged
 
 
-def _damaged_chunks(file: Reader, memory: int) -> list[tuple[int, str, FormatError]]:
-    """Return the number, kind and error of each damaged chunk of a scene.
+def _damaged_chunks(file: Reader, memory: int, skipped: Collection[int] = ()) -> list[tuple[int, str, FormatError]]:
+    """Return the number, kind and error of each damaged chunk of a scene, but for shared planes in these chunks of its
+    clip.
 
     Raises:
         FormatError: no chunk is damaged, but what they hold is not valid.
@@ -259,6 +284,8 @@ def _damaged_chunks(file: Reader, memory: int) -> list[tuple[int, str, FormatErr
         raise
     damaged = []
     for number, entry in in_parts(list(enumerate(reader.index))):
+        if number in reader.beside and reader.beside[number].chunk in skipped:
+            continue
         try:
             reader.segment(number) if entry.kind == "PLNE" else reader.stored(number)
         except FormatError as error:
@@ -270,8 +297,11 @@ def _damaged_chunks(file: Reader, memory: int) -> list[tuple[int, str, FormatErr
 
 
 def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
-    """Return what there is to say about a decoded scene. Shares that chunks which are missing would change are None."""
-    size = reader.header.file_length
+    """Return what there is to say about a decoded scene. Shares that chunks which are missing would change are None.
+
+    Planes that a group shares count as if they lay in it.
+    """
+    size = reader.header.file_length + sum(reader.index[number].stored_length for number in reader.beside)
     missing = [not reader.available(number) for number in range(len(reader.index))]
     is_whole = not any(missing)
     partial = {
@@ -312,7 +342,10 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
         if is_whole
         else None,
         "overhead_bytes": size - sum(entry.stored_length for entry in reader.index),
-        "chunks": [_describe_chunk(entry, gone, size) for entry, gone in zip(reader.index, missing, strict=True)],
+        "chunks": [
+            _describe_chunk(entry, missing[number], size, reader.beside.get(number))
+            for number, entry in enumerate(reader.index)
+        ],
     }
 
 
@@ -364,7 +397,22 @@ def _describe_scale(scale: Mapping[str, QuantisedPlane], partial: set[str]) -> d
     }
 
 
-def _describe_chunk(entry: Entry, missing: bool, size: int) -> dict[str, Any]:
+def _shared_plane(reader: Reader, number: int, group_count: int) -> dict[str, Any]:
+    """Return what the index of a clip says of a shared plane."""
+    entry = reader.index[number]
+    return {
+        "chunk": number,
+        "scale": entry.scale,
+        "plane": ALL_PLANES[entry.plane],
+        "first_group": entry.group,
+        "group_count": group_count,
+        "codec": CODEC_NAMES[entry.codec],
+        "stored_bytes": entry.stored_length,
+        "missing": not reader.available(number),
+    }
+
+
+def _describe_chunk(entry: Entry, missing: bool, size: int, shared: Beside | None) -> dict[str, Any]:
     is_plane = entry.kind == "PLNE"
     return {
         "kind": entry.kind,
@@ -373,11 +421,12 @@ def _describe_chunk(entry: Entry, missing: bool, size: int) -> dict[str, Any]:
         "plane": ALL_PLANES[entry.plane] if is_plane else None,
         "rows": [entry.row_start, entry.row_start + entry.row_count - 1] if is_plane else None,
         "codec": CODEC_NAMES.get(entry.codec, str(entry.codec)),
-        "offset": entry.offset,
+        "offset": entry.offset if shared is None else None,
         "stored_bytes": entry.stored_length,
         "raw_bytes": entry.raw_length,
         "share": None if missing else entry.stored_length / size,
         "missing": missing,
+        "shared_chunk": None if shared is None else shared.chunk,
     }
 
 

@@ -25,7 +25,7 @@ def page(info: Mapping[str, Any]) -> str:
         lines += _item(label, printable(text))
     if described is None:
         lines += _item("clip", _clip(info)) + _sound(info["groups"]) + _item("cameras", str(info["cameras"]))
-        return "\n".join([*lines, *_groups(info)])
+        return "\n".join([*lines, *_groups(info), *_shared_planes(info["shared_planes"])])
     if len(info["groups"]) > 1:
         since, until = described["shown_s"]
         frames = "frames {}-{}".format(*described["frames"])
@@ -36,6 +36,7 @@ def page(info: Mapping[str, Any]) -> str:
     lines += _sound([described])
     scene = described["scene"]
     whole = info["expected_bytes"] if len(info["groups"]) == 1 else described["stored_bytes"]
+    whole += sum(chunk["stored_bytes"] for chunk in scene["chunks"] if chunk["shared_chunk"] is not None)
     return "\n".join([*lines, *_scene_lines(scene), "", *_chunk_lines(scene, whole)])
 
 
@@ -117,6 +118,18 @@ def _groups(info: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def _shared_planes(planes: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a table of the planes that groups share; nothing without any."""
+    lines = ["", "  chunk  shared plane  codec          stored  in groups"] if planes else []
+    for plane in planes:
+        users = f"{plane['group_count']}, from {plane['first_group']} on" if plane["group_count"] else "none"
+        lines.append(
+            f"  {plane['chunk']:>5}  {'scale ' + str(plane['scale']):<9} {plane['plane']}  {plane['codec']:<10} "
+            f"{plane['stored_bytes']:>10,}  {'missing' if plane['missing'] else users}"
+        )
+    return lines
+
+
 def _scene_lines(scene: Mapping[str, Any]) -> list[str]:
     occupancy, decoder = scene["occupancy"], scene["decoder"]
     cameras = str(scene["cameras"])
@@ -169,8 +182,9 @@ def _chunk_lines(scene: Mapping[str, Any], size: int) -> list[str]:
             rows = "{}-{}".format(*chunk["rows"])
             plane = f"{chunk['scale']:>5} {chunk['plane']:<5}  {rows:>9}"
         share = "missing" if chunk["missing"] else f"{chunk['share']:.1%}"
+        codec = chunk["codec"] if chunk["shared_chunk"] is None else "SHARED"
         lines.append(
-            f"  {number:>5}  {chunk['kind']}  {plane}  {chunk['codec']:<10} "
+            f"  {number:>5}  {chunk['kind']}  {plane}  {codec:<10} "
             f"{chunk['stored_bytes']:>10,}  {chunk['raw_bytes']:>10,} {share:>7}"
         )
     overhead = scene["overhead_bytes"]
