@@ -50,6 +50,8 @@ class Groups:
         allow_partial, in_parts: as for `SceneReader`.
         reads_metadata: whether metadata beside the groups are read, and refused if they are wrong, at once rather than
             when they are asked for.
+        needs_first: whether the first group must be readable; if not, the rate of the clip is that of the first one
+            that is.
 
     Attributes:
         timeline: which group is shown when.
@@ -68,13 +70,14 @@ class Groups:
         allow_partial: bool = False,
         in_parts: bool = False,
         reads_metadata: bool = True,
+        needs_first: bool = True,
     ) -> None:
         source = open_source(source, limit=memory_budget)
         self.reader = Reader(source, allow_partial=allow_partial)
         self.name, self._budget, self._in_parts = self.reader.name, memory_budget, in_parts
         self._shared: SharedPlanes | None = None
         self._chunks = [number for number, entry in enumerate(self.reader.index) if entry.kind == GROUP_KIND]
-        self.is_single = not self._chunks
+        self.is_single, self._first_number = not self._chunks, 0
         if self.is_single:
             self._first = SceneReader(
                 self.reader, memory_budget=memory_budget, allow_partial=allow_partial, in_parts=in_parts
@@ -86,11 +89,11 @@ class Groups:
                 self.reader.source = open_source(source.read_at(0, source.size))
             spans = self._spans()
             self._shared = SharedPlanes(self.reader, len(spans), memory_budget)
-            self._first = self._opened(0, self._slice(0, self.reader.source))
+            self._first_number, self._first = self._first_readable(1 if needs_first else len(spans))
         if reads_metadata:
             _ = self._beside
         self.timeline = Timeline(spans, self._first.head.clip.fps)
-        self._check(0, self._first)
+        self._check(self._first_number, self._first)
 
     def __len__(self) -> int:
         return len(self.timeline.spans)
@@ -126,7 +129,7 @@ class Groups:
         Raises:
             FormatError, BudgetError: as `SceneReader`, or the group contradicts the index.
         """
-        if number == 0 and not apart:
+        if number == self._first_number and not apart:
             return self._first
         scene = self._opened(number, self.source_of(number) if apart else self._slice(number, self.reader.source))
         self._check(number, scene)
@@ -152,11 +155,11 @@ class Groups:
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras of the first group, which stand for all."""
-        return self._first.cameras()
+        return self.open(0).cameras()
 
     def metadata(self) -> Metadata:
         """Return the metadata beside the groups, which are those of the clip; without any, those of the first group."""
-        return self._first.metadata() if self._beside is None else self._beside
+        return self.open(0).metadata() if self._beside is None else self._beside
 
     @cached_property
     def _beside(self) -> Metadata | None:
@@ -197,6 +200,16 @@ class Groups:
         spans = tuple(Span(entries[chunk].row_start, entries[chunk].row_count) for chunk in self._chunks)
         check_spans(spans, self.name)
         return spans
+
+    def _first_readable(self, count: int) -> tuple[int, SceneReader]:
+        """Open the first group of so many that can be opened; raise what is wrong with the first one if none can."""
+        wrong: list[FormatError] = []
+        for number in range(count):
+            try:
+                return number, self._opened(number, self._slice(number, self.reader.source))
+            except FormatError as error:
+                wrong.append(error)
+        raise wrong[0]
 
     def _slice(self, number: int, source: Source) -> Source:
         entry = self.reader.index[self._chunks[number]]

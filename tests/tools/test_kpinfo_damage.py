@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from kpc.format.common.errors import FormatError
 from kpc.format.container import groups
 from kpc.format.container.container import Reader
 from kpc.format.container.rewriting import with_metadata
@@ -66,6 +67,19 @@ def test_chunks_of_several_groups_and_beside_them(scene, tmp_path, capsys):
     assert found == {(0, "soun"), (1, "SCNE"), (None, "GRUP"), (None, "meta")} and "4 chunks" in info["error"]
     assert (info["metadata"], sums["groups"], sums["frame_count"]) == (None, 3, 66)
     assert [one["value_count"] is None for one in info["groups"]] == [False, True, True]
+    info, sums = verified(path, damaged(whole, places[0] + inner["SCNE"]), capsys)
+    assert "group 0: chunk" in info["error"] and [one["group"] for one in info["damaged_chunks"]] == [0]
+    assert (info["metadata"], sums["groups"], sums["frame_count"]) == ({"title": "Dances"}, 3, 66)
+    assert [one["is_complete"] for one in info["groups"]] == [False, True, True] and info["cameras"] is None
+    assert kpinfo.main([str(path)]) == 1
+    printed, said = capsys.readouterr()
+    lines = printed.splitlines()
+    table = lines[lines.index("") + 2 :][:3]
+    assert [line.endswith("damaged") for line in table] == [True, False, False], printed
+    assert "group 0: chunk" in said and said.count("\n") == 1
+    assert kpinfo.main([str(path), "--group", "1", "--verify"]) == 0 and "group 1" in capsys.readouterr().out
+    with pytest.raises(FormatError, match=r"group 0: chunk \d \(SCNE\) is damaged"):
+        groups.Groups(path)
     info, _ = verified(path, damaged(whole, wrong[0]), capsys)
     assert info["metadata"] == {"title": "Dances"} and [one["kind"] for one in info["damaged_chunks"]] == ["soun"]
     assert kpinfo.main([str(path), "--verify", "--group", "2"]) == 0

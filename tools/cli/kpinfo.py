@@ -50,7 +50,7 @@ def _command(argv: list[str]) -> None:
         cli.print_json({"schema": SCHEMA, "files": files, "totals": sums})
     elif not is_one:
         print(table(files, sums))
-    elif not sums["failed"]:
+    elif not sums["failed"] or len(files[0]["groups"]) > 1:  # of a damaged clip, what can be read
         print(page(files[0]))
     if sums["failed"]:
         are = agreeing(sums["failed"], "is", "are")

@@ -80,8 +80,8 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
         if verify:
             with _noting(info):
                 _verify(reader, group, memory, info)
-        groups = Groups(source, memory_budget=memory, allow_partial=True, reads_metadata=False)
-        _describe_file(groups, info)
+        groups = Groups(source, memory_budget=memory, allow_partial=True, reads_metadata=False, needs_first=False)
+        _describe_file(groups, group, info)
         if info["error"] is None and (details or not verify) and (group is not None or groups.is_single):
             scene_reader = groups.open(group or 0)
             # Without details, too: it finds damage.
@@ -106,15 +106,21 @@ def _noting(info: dict[str, Any]) -> Iterator[None]:
             info["error"] = f"{message}; give more with --memory" if isinstance(error, BudgetError) else message
 
 
-def _describe_file(groups: Groups, info: dict[str, Any]) -> None:
-    """Set what can be read without decoding planes."""
+def _describe_file(groups: Groups, only: int | None, info: dict[str, Any]) -> None:
+    """Set what can be read without decoding planes; what is wrong with other groups than `only`, if that is not None,
+    is no error.
+    """
+
+    def noted(number: int) -> dict[str, Any]:
+        return info if only in (None, number) else dict(info)
+
     info["clip"], users = _clip(groups.clip), Counter[int]()
-    info["groups"] = [_group(groups, span, info, users) for span in sound_spans(groups.timeline)]
+    info["groups"] = [_group(groups, span, noted(span.group), users) for span in sound_spans(groups.timeline)]
     info["shared_planes"] = [_shared_plane(groups.reader, number, users[number]) for number in groups.reader.beside]
     info["clip"]["is_dynamic"] = any(one["is_dynamic"] for one in info["groups"])
-    with _noting(info):
+    with _noting(noted(0)):
         info["cameras"] = len(groups.cameras())
-    with _noting(info):
+    with _noting(noted(0)):
         info["metadata"] = dict(groups.metadata().document)
 
 

@@ -21,10 +21,11 @@ def page(info: Mapping[str, Any]) -> str:
     name = one_line(info["file"])
     lines = [f"{name}:", f"  {first}"] if len(name) + len(first) > WIDTH - 2 else [f"{name}: {first}"]
     sizes = described["scene"]["camera_sizes"] if described else []
-    for label, text in metadata_rows(Metadata(info["metadata"]), sizes):
+    for label, text in metadata_rows(Metadata(info["metadata"] or {}), sizes):
         lines += _item(label, printable(text))
     if described is None:
-        lines += _item("clip", _clip(info)) + _sound(info["groups"]) + _item("cameras", str(info["cameras"]))
+        lines += _item("clip", _clip(info)) + _sound(info["groups"])
+        lines += _item("cameras", "not known" if info["cameras"] is None else str(info["cameras"]))
         return "\n".join([*lines, *_groups(info), *_shared_planes(info["shared_planes"])])
     if len(info["groups"]) > 1:
         since, until = described["shown_s"]
@@ -108,9 +109,10 @@ def _sound(groups: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _groups(info: Mapping[str, Any]) -> list[str]:
     lines = ["", "  group       frames          shown, s       stored   scales       values"]
+    unread = "missing" if info["size_bytes"] < info["expected_bytes"] else "damaged"
     for group in info["groups"]:
         (first, last), (since, until) = group["frames"], group["shown_s"]
-        model = f"{group['scale_count']:>7}  {group['value_count']:>11,}" if group["is_complete"] else "missing"
+        model = f"{group['scale_count']:>7}  {group['value_count']:>11,}" if group["is_complete"] else unread
         lines.append(
             f"  {group['number']:>5}  {first:>6}-{last:<6}  {since:>8.2f}-{until:<8.2f}  "
             f"{group['stored_bytes']:>9,}  {model}"
