@@ -191,7 +191,8 @@ def _plane_chunks(scene: QuantisedScene, segment_rows: int | None) -> list[Chunk
         plane = scene.scales[number][name]
         symbols, coded = plane.symbols[start:stop], plane.coded[start:stop]
         side_info = side_info_at(plane.side_info, start)
-        codec, make = choose_codec(symbols, coded, side_info, implied[number][name][start:stop])
+        implied_here = None if plane.stores_map else implied[number][name][start:stop]
+        codec, make = choose_codec(symbols, coded, side_info, implied_here)
         position = number, plane_number, start, stop - start
         chunks.append(Chunk("PLNE", encode_raw_segment(symbols, coded), *position, codec, make, symbols.size))
     return chunks + sound

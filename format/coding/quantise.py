@@ -45,6 +45,8 @@ class QuantisedPlane:
         coded: (H, W) bool, the texels whose symbols the file stores.
         side_info: what the symbols were chosen with, if anything; if they do not follow it, that does no harm.
         starts: the first rows of the segments that symbols were chosen for; empty: those of `rows_per_segment`.
+        stores_map: whether the file stores `coded` even where the occupancy implies it, so that the plane can be shared
+            by groups of other occupancy.
     """
 
     symbols: np.ndarray
@@ -53,6 +55,7 @@ class QuantisedPlane:
     coded: np.ndarray
     side_info: PlaneSideInfo | None = None
     starts: tuple[int, ...] = ()
+    stores_map: bool = False
 
     def dequantise(self) -> np.ndarray:
         """Return (H, W, M) float32 values."""

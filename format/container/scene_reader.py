@@ -52,6 +52,7 @@ from kpc.format.container.segments import (
     merge_side_info,
     needs_occupancy,
     side_info_of,
+    stores_map,
 )
 from kpc.format.container.sound_chunk import SOUND_LIMIT, SoundSegment, parse_sound, sound_chunks, sound_of
 from kpc.format.container.sources import AnySource, RemoteSource, open_source
@@ -130,12 +131,13 @@ def _read_planes(reader: "SceneReader") -> tuple[dict[str, QuantisedPlane], ...]
     side_info: dict[tuple[int, str], dict[int, SegmentSideInfo | None]] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         decoded = pool.map(reader.segment_with_side_info, segments)
-        for number, (symbols, coded, info) in zip(segments, decoded, strict=True):
+        for number, (symbols, coded, info, has_map) in zip(segments, decoded, strict=True):
             entry = reader.index[number]
             name = ALL_PLANES[entry.plane]
             plane, rows = scales[entry.scale][name], slice(entry.row_start, entry.row_start + entry.row_count)
             if entry.row_count == len(plane.symbols):  # spares a copy
-                scales[entry.scale][name] = replace(plane, symbols=symbols, coded=coded)
+                has_map = has_map and name in SPACE_PLANES
+                scales[entry.scale][name] = replace(plane, symbols=symbols, coded=coded, stores_map=has_map)
             else:
                 plane.symbols[rows], plane.coded[rows] = symbols, coded
             side_info.setdefault((entry.scale, name), {})[entry.row_start] = info
@@ -215,18 +217,23 @@ class SceneReader(Reader):
 
     def segment(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Decode a PLNE chunk: (row_count, W, M) int8 symbols and (row_count, W) bool coded texels."""
-        symbols, coded, _ = self.segment_with_side_info(number)
+        symbols, coded, *_ = self.segment_with_side_info(number)
         return symbols, coded
 
-    def segment_with_side_info(self, number: int) -> tuple[np.ndarray, np.ndarray, SegmentSideInfo | None]:
-        """Decode a PLNE chunk; the third result is its side information, with which it can be encoded again."""
+    def segment_with_side_info(self, number: int) -> tuple[np.ndarray, np.ndarray, SegmentSideInfo | None, bool]:
+        """Decode a PLNE chunk, and return with what it can be encoded again.
+
+        Returns:
+            Symbols and coded texels as `segment`, its side information, and whether its texel map is stored under one
+            of the codecs that could imply it.
+        """
         entry = self.index[number]
         plane = self.head.scales[entry.scale][ALL_PLANES[entry.plane]]
         texels, shape = entry.row_count * plane.columns, (entry.row_count, plane.columns, plane.channels)
         limit = self.memory_budget
         if entry.codec not in (Codec.PREDICTIVE, Codec.TRANSFORM):
             payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * texels)
-            return *self._parsed(lambda raw: decode_segment(Codec.RAW, raw, *shape, None, limit), payload), None
+            return *self._parsed(lambda raw: decode_segment(Codec.RAW, raw, *shape, None, limit), payload), None, False
         if entry.raw_length != texels * plane.channels:
             raise FormatError(
                 f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
@@ -240,6 +247,7 @@ class SceneReader(Reader):
             lambda body: (
                 *decode_segment(entry.codec, body, *shape, implied, limit),
                 side_info_of(entry.codec, body),
+                stores_map(body),
             ),
             body,
         )

@@ -118,4 +118,13 @@ def side_info_of(codec: int, body: bytes) -> SegmentSideInfo | None:
 
 def needs_occupancy(body: bytes) -> bool:
     """Return whether the map of a segment under PREDICTIVE or TRANSFORM follows from the occupancy."""
-    return len(body) > 1 and body[1] & (1 << MODE_BITS) - 1 == MAP_IMPLIED
+    return _map_mode(body) == MAP_IMPLIED
+
+
+def stores_map(body: bytes) -> bool:
+    """Return whether a segment under PREDICTIVE or TRANSFORM holds its map."""
+    return _map_mode(body) == MAP_CODED
+
+
+def _map_mode(body: bytes) -> int | None:
+    return body[1] & (1 << MODE_BITS) - 1 if len(body) > 1 else None
