@@ -277,6 +277,30 @@ def test_groups_are_placed_retimed_and_cut(clip, capsys):
     assert "held_out" not in opened.metadata().provenance
 
 
+@pytest.mark.parametrize("words", [["--box", "-0.4,-0.8,-0.6,0.2,0.5,0.4"], ["--turn", "x:90"]])
+def test_groups_share_after_an_edit_what_they_shared_before(words, tmp_path):
+    """Each group reads other texels of the planes; those that none reads are left out."""
+    scene = quantised()
+    planes = [{name: replace(one, stores_map=True) for name, one in scale.items()} for scale in scene.scales]
+    cells = np.indices(scene.occupancy.shape)[3] < scene.occupancy.shape[3] // 3
+    for number, occupied in enumerate((scene.occupancy & cells, scene.occupancy & ~cells)):
+        write(replace(scene, scales=tuple(planes), occupancy=occupied), tmp_path / f"{number}.kpc")
+    parts = [groups.GroupInput.of(tmp_path / f"{number}.kpc", 11 * number) for number in range(2)]
+    source, out = tmp_path / "clip.kpc", tmp_path / "out.kpc"
+    groups.write(parts, source)
+    assert kpedit.main([str(source), "-o", str(out), *words]) == 0
+    opened, before = groups.Groups(out), groups.Groups(source)
+    assert len(opened.reader.beside) == len(before.reader.beside) > 5
+    size = [sum(clip.reader.index[number].stored_length for number in clip.reader.beside) for clip in (opened, before)]
+    if words[0] == "--box":
+        assert size[0] < size[1]
+        box = np.reshape([float(number) for number in words[1].split(",")], (2, 3))
+        for number in range(2):
+            camera = scene.cameras[0]
+            expected = picture(cropped(read(before.open(number)), box), camera, 0.4)
+            assert picture(read(opened.open(number)), camera, 0.4)[0] == pytest.approx(expected[0], abs=1e-6)
+
+
 def test_only_planes_that_are_coded_anew_are_said_to_be_larger(clip, capsys):
     """A part of a group may be larger by its planes; a part that is widened to all groups is none."""
     description = "".join(hashlib.sha512(text).hexdigest() for text in (b"a", b"b", b"c"))  # hardly compressed

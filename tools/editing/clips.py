@@ -14,10 +14,11 @@ from kpc.format.container.groups import Span
 from kpc.format.container.rewriting import with_metadata
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Clip
-from kpc.tools.editing.cropping import cropped
+from kpc.tools.editing.cropping import cropped, shared_texels
 from kpc.tools.editing.files import edited
 from kpc.tools.editing.placing import Placement, placed, placed_metadata
 from kpc.tools.editing.timing import at_rate, at_speed, check_part, check_rate, check_speed, spans_at_rate, trimmed
+from kpc.tools.editing.unread import SharedTexels
 
 
 @dataclass(frozen=True)
@@ -108,19 +109,20 @@ def _edit_groups(
         except FormatError as error:
             raise UsageError(f"--fps {edits.fps:g}: at this rate the groups have too few or too many frames") from error
     parts = []
-    for number, span in progress(list(zip(numbers, spans, strict=True)), "editing", unit="groups"):
+    texels = [None] * len(numbers) if edits.box is None else shared_texels(clip, numbers, edits.box)
+    for number, span, shared in progress(list(zip(numbers, spans, texels, strict=True)), "editing", unit="groups"):
 
-        def change(scene: QuantisedScene, span: Span = span) -> QuantisedScene:
+        def change(scene: QuantisedScene, span: Span = span, shared: SharedTexels | None = shared) -> QuantisedScene:
             sound = scene.sound if edits.speed is None else None
-            return replace(_changed(scene, edits), clip=Clip(span.count, edits.fps or fps), sound=sound)
+            return replace(_changed(scene, edits, shared), clip=Clip(span.count, edits.fps or fps), sound=sound)
 
         parts.append(groups.GroupInput.of(edited(clip.open(number), change), span.start))
     return groups.write(parts, output, metadata), kept
 
 
-def _changed(scene: QuantisedScene, edits: Edits) -> QuantisedScene:
+def _changed(scene: QuantisedScene, edits: Edits, shared: SharedTexels | None = None) -> QuantisedScene:
     if edits.box is not None:
-        scene = cropped(scene, edits.box)
+        scene = cropped(scene, edits.box, shared)
     return scene if edits.placement is None else placed(scene, edits.placement)
 
 

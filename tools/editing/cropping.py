@@ -1,23 +1,27 @@
 """A part of a scene: the cells of its occupancy grid outside a box are emptied, and what nothing reads is left out."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from kpc.format.coding.quantise import QuantisedScene
+from kpc.format.coding.quantise import QuantisedScene, looked_up_cells, needed_texels
 from kpc.format.common.errors import UsageError
-from kpc.format.scene.scene import Scene
+from kpc.format.container.groups import Groups
+from kpc.format.container.partial import PartialScene
+from kpc.format.scene.scene import ALL_PLANES, Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, uncontract
-from kpc.tools.editing.unread import without_unread
+from kpc.tools.editing.unread import SharedTexels, without_unread
 
 
-def cropped(scene: QuantisedScene, box: np.ndarray) -> QuantisedScene:
+def cropped(scene: QuantisedScene, box: np.ndarray, shared: SharedTexels | None = None) -> QuantisedScene:
     """Return the part of a scene in the cells that a box touches; pictures of these cells stay as they are.
 
     Args:
         scene: of any mapping.
         box: (2, 3) lower and upper corner, world units.
+        shared: of a group, what `shared_texels` says.
 
     Raises:
         UsageError: the box holds nothing.
@@ -26,7 +30,29 @@ def cropped(scene: QuantisedScene, box: np.ndarray) -> QuantisedScene:
     occupancy = scene.occupancy & inside
     if not occupancy.any():
         raise UsageError(f"--box: there is nothing from {box[0].tolist()} to {box[1].tolist()}")
-    return without_unread(replace(scene, occupancy=occupancy), scene.occupancy)
+    return without_unread(replace(scene, occupancy=occupancy), scene.occupancy, shared)
+
+
+def shared_texels(clip: Groups, numbers: Sequence[int], box: np.ndarray) -> list[SharedTexels]:
+    """Return for each of some groups what any of them reads in a box of the planes that it shares."""
+    found: dict[tuple[int, ...], np.ndarray] = {}  # by chunk and shape
+    places: list[dict[tuple[int, str], tuple[int, ...]]] = []
+    for number in numbers:
+        reader = clip.open(number)
+        places.append({})
+        if not reader.beside:
+            continue
+        scene = PartialScene(reader).scene
+        inside = looked_up_cells(replace(scene, occupancy=scene.occupancy & _touched_cells(scene, box)))
+        for chunk, plane in reader.beside.items():
+            entry = reader.index[chunk]
+            name = ALL_PLANES[entry.plane]
+            head = reader.head.scales[entry.scale][name]
+            key = plane.chunk, head.rows, head.columns
+            texels = needed_texels(inside, name, head.rows, head.columns)
+            found[key] = found[key] | texels if key in found else texels
+            places[-1][entry.scale, name] = key
+    return [{place: found[key] for place, key in keys.items()} for keys in places]
 
 
 def _touched_cells(scene: Scene, box: np.ndarray) -> np.ndarray:

@@ -181,7 +181,11 @@ def _turned_plane(scale: Any, name: str, source: np.ndarray, sign: np.ndarray) -
     if is_transposed:
         symbols, coded = symbols.swapaxes(0, 1), coded.T
     return QuantisedPlane(
-        np.ascontiguousarray(symbols[tuple(flips)]), old.step, old.offset, np.ascontiguousarray(coded[tuple(flips)])
+        np.ascontiguousarray(symbols[tuple(flips)]),
+        old.step,
+        old.offset,
+        np.ascontiguousarray(coded[tuple(flips)]),
+        stores_map=old.stores_map,
     )
 
 
