@@ -15,10 +15,17 @@ from typing import Any
 import numpy as np
 
 from kpc.encoder.cli.encode_scene import encode_scene
-from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group, spans_of
+from kpc.encoder.cli.grouped import (
+    LATER_STEPS,
+    STILL_SHARE,
+    options_of_group,
+    plan_sharing,
+    shared_bytes,
+    spans_of,
+)
 from kpc.encoder.cli.metadata import clip_metadata, hash_dataset
 from kpc.encoder.cli.options import Options
-from kpc.encoder.cli.prepare import Setting, find_layers, prepare_setting, trim_with_progress
+from kpc.encoder.cli.prepare import Layers, Setting, find_layers, prepare_setting, trim_with_progress
 from kpc.encoder.cli.report import log
 from kpc.encoder.cli.sound import sound_of_span
 from kpc.encoder.cli.transcode import combine_figures
@@ -60,12 +67,17 @@ def encode_groups(options: Options) -> dict[str, Any]:
     config = options.config(setting.dataset)
     layers = find_layers(options, config, setting.dataset, setting.aabb, setting.mapping)
     setting = replace(setting, layers=layers)
+    if layers.area is not None and len(numbers) > 1:
+        sharing = plan_sharing(config, setting.dataset, setting.aabb, setting.mapping, layers.area)
+        setting = replace(setting, sharing=sharing)
+        log("what stands still is trained and coded with the first group, and shared by all")
     found: list[dict[str, Any]] = []
+    shared = 0
     for number in numbers:
         span, path = spans[number], group_path(work, number)
         log(f"group {number} of {len(spans)}: frames {span.start} to {span.last}")
         group_options = replace(
-            options_of_group(options, number, spans),
+            options_of_group(options, number, spans, 0.0 if setting.sharing is None else STILL_SHARE, shared),
             output=path,
             work=path.with_suffix(""),
             keep_checkpoint=options.keep_checkpoint or path.with_suffix(".kpck"),
@@ -78,7 +90,12 @@ def encode_groups(options: Options) -> dict[str, Any]:
         if number == numbers[0] and found[0]["refine"] != "none" and has_static_cameras(setting.dataset):
             corrected = with_corrections(setting.dataset, found[0]["corrections"])
             setting = replace(setting, dataset=corrected, refined=found[0]["refine"])
+        if number == numbers[0] and setting.sharing is not None:
+            shared = shared_bytes(path, setting.sharing.planes)
+            setting = replace(setting, sharing=setting.sharing.after(scene_io.read(path)))
     parts = [groups.GroupInput.of(group_path(work, number), spans[number].start) for number in numbers]
+    for one in found[1:]:
+        one["size_bytes"] -= shared
     figures = _combine(found, [spans[number] for number in numbers], 0, options)
     size = _join(parts, clip_metadata([part.metadata for part in parts], figures), options)
     if not options.keep:
@@ -108,7 +125,11 @@ def group_path(work: Path, number: int) -> Path:
 def setting_of_span(setting: Setting, span: groups.Span) -> Setting:
     """Return the setting for the frames of one group."""
     dataset, clip = setting.dataset.frame_range(span.start, span.last), setting.dataset.clip
-    return replace(setting, dataset=dataset, sound=sound_of_span(setting.sound, span, clip.fps))
+    layers = setting.layers
+    if layers is not None and layers.area is not None:
+        frames = max(clip.frame_count - 1, 1)
+        layers = Layers(layers.area.between(span.start / frames, span.last / frames))
+    return replace(setting, dataset=dataset, layers=layers, sound=sound_of_span(setting.sound, span, clip.fps))
 
 
 def _trim_for_groups(setting: Setting, options: Options, spans: Sequence[groups.Span]) -> Setting:

@@ -34,6 +34,7 @@ from kpc.encoder.field.occupancy_grid import merge_slots
 from kpc.encoder.rdo.codec_model import CodedModel, Model, check_size, code
 from kpc.encoder.rdo.model_checkpoint import save_checkpoint
 from kpc.encoder.rdo.sequential_finetune import steps_per_group
+from kpc.encoder.rdo.sharing import Sharing
 from kpc.encoder.training.refinement import Correction
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common import interrupts
@@ -106,7 +107,7 @@ def _write(options: Options, setting: Setting, trainer: Trainer, started: float)
     metadata = describe(described, dataset, scene, pictures, dataset_sha256)
     scene = replace(scene, metadata=metadata, sound=setting.sound)
     coding_from_s = working_s()
-    coded = _code(trainer, scene, reserve_figures(options))
+    coded = _code(trainer, scene, reserve_figures(options), setting.sharing)
     coding_s = working_s() - coding_from_s
     save_scene(coded.data, options.output, work)
     decoded = scene_io.read(options.output).dequantise()
@@ -178,11 +179,12 @@ def _test_figures(test: Quality | None, dataset: Dataset) -> dict[str, Any]:
     }
 
 
-def _code(trainer: Trainer, scene: Scene, options: Options) -> CodedModel:
+def _code(trainer: Trainer, scene: Scene, options: Options, sharing: Sharing | None) -> CodedModel:
     """Code a trained scene, and keep its finished checkpoint where asked for."""
     tune_steps = options.tune_steps
     if tune_steps is None:
-        tune_steps = steps_per_group(trainer.step, scene, trainer.config.tune_steps)
+        settled = () if sharing is None else sharing.settled.keys()
+        tune_steps = steps_per_group(trainer.step, scene, trainer.config.tune_steps, settled)
     log(describe_occupancy(scene))
     if tune_steps:
         log(f"fine-tuning: {counted(tune_steps, 'step')} after each group of planes that is coded")
@@ -193,7 +195,10 @@ def _code(trainer: Trainer, scene: Scene, options: Options) -> CodedModel:
     if options.keep_checkpoint is not None:
         save_checkpoint(options.keep_checkpoint, scene, validation)
     coded = code(
-        Model(scene, validation, shown=True, effort=effort), options.trade, trainer.config.prune_share, tune_steps
+        Model(scene, validation, shown=True, effort=effort, sharing=sharing),
+        options.trade,
+        trainer.config.prune_share,
+        tune_steps,
     )
     if coded.pruned is not None:
         log(*describe_pruning(scene, coded.pruned, coded.spare_db).split("\n"))

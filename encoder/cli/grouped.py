@@ -1,30 +1,44 @@
 """A long clip in groups (`kpc.format.container.groups`): the frames of each group, and its start from the one before.
 
-The planes of each group are coded anew; why differences from the group before do not pay, and the figures behind the
-constants: docs/design/rate-distortion.md, "Groups of a long clip".
+Where what moves has scales of its own, the others are trained and coded with the first group and shared by all
+(`kpc.encoder.rdo.sharing`). All other planes of a group are coded anew; why differences from the group before do not
+pay, and the figures behind the constants: docs/design/rate-distortion.md, "Groups of a long clip".
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 
 from kpc.encoder.cli.options import Options
+from kpc.encoder.datasets import Dataset
+from kpc.encoder.field.bounds import visible_cells
+from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
+from kpc.encoder.field.layout import plan_layout
+from kpc.encoder.field.occupancy_grid import grid_shape
+from kpc.encoder.rdo.distortion import PlaneKey
 from kpc.encoder.rdo.rate_control import Trade
+from kpc.encoder.rdo.sharing import Sharing
+from kpc.encoder.training.moving_area import MovingArea
+from kpc.format.coding.quantise import QuantisedPlane
 from kpc.format.common.errors import UsageError
 from kpc.format.common.text import agreeing, counted
 from kpc.format.container.container import ENTRY, HEADER
 from kpc.format.container.groups import Span
-from kpc.format.scene.scene import TIME_PLANES, Clip, Scene
+from kpc.format.container.scene_io import SceneReader
+from kpc.format.container.sources import AnySource
+from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, Clip, Scene
+from kpc.format.scene.space import SpaceMapping
 
 # Frames that a group holds beyond those that it shows, at either end where there are more. So two groups share four
 # frames, of which the player mixes the inner two.
 OVERLAP = 2
 LATER_STEPS = 0.5  # training steps of a group that starts where another ended, as a share of those of the first
 MIN_FRAMES = 8  # of a group
+STILL_SHARE = 0.6  # of a group's bytes that are of planes in which nothing moves, about
 CLIP_BYTES = 1536  # that the metadata of a clip may take beside its groups, without the texts that are given
 
 
@@ -63,19 +77,61 @@ def spans_of(options: Options, clip: Clip) -> tuple[Span, ...]:
     return spans
 
 
-def options_of_group(options: Options, number: int, spans: Sequence[Span]) -> Options:
-    """Return the options of one group: its share of the file's size by frames, and of the training time by steps."""
+def options_of_group(
+    options: Options, number: int, spans: Sequence[Span], still_share: float = 0.0, shared: int = 0
+) -> Options:
+    """Return the options of one group: its share of the file's size by frames, and of the training time by steps.
+
+    Args:
+        options: of the clip.
+        number: of the group.
+        spans: the frames of each.
+        still_share: share of the first group's bytes that the others share.
+        shared: bytes that this group has from the first.
+    """
     frames = np.array([span.count for span in spans], float)
     effort = frames * np.where(np.arange(len(spans)), LATER_STEPS, 1.0)
     trade, budget_s = options.trade, options.time_budget_s
     if trade.target_bytes is not None:
-        share = frames[number] / frames.sum()
+        parts = frames / np.where(np.arange(len(spans)), 1.0, 1 - still_share)
+        share = parts[number] / parts.sum()
         texts = sum(len(text.encode()) for text in options.members.values())
         beside = ENTRY.size * (len(spans) + 1) + CLIP_BYTES + texts
-        trade = Trade(target_bytes=int(share * max(1, trade.target_bytes - HEADER.size - beside)))
+        trade = Trade(target_bytes=int(share * max(1, trade.target_bytes - HEADER.size - beside)) + shared)
     if budget_s is not None:
         budget_s *= float(effort[number] / effort.sum())
     return replace(options, trade=trade, time_budget_s=budget_s)
+
+
+def plan_sharing(
+    config: TrainConfig, dataset: Dataset, aabb: np.ndarray, mapping: SpaceMapping | None, area: MovingArea
+) -> Sharing:
+    """Return what all groups of a clip share: the scales in which nothing moves, with all that any group may see there.
+
+    Args:
+        config: of training. dataset: of the whole clip. aabb: (2, 3), its box. mapping: of space beyond the box.
+        area: where things move at any time of the clip.
+    """
+    layout = plan_layout(replace(config, moving_area=area.box), aabb, dataset.clip, dataset.is_dynamic)
+    shape = grid_shape(aabb, config.cells_across)
+    return Sharing.of_scales(
+        layout.still_scales, area.cells(shape) & visible_cells(dataset.pictures, aabb, shape, mapping)
+    )
+
+
+def shared_bytes(source: AnySource, planes: Collection[PlaneKey]) -> int:
+    """Return what some planes of a file take, in bytes."""
+    index = SceneReader(source, in_parts=True).index
+    chosen = (entry for entry in index if entry.kind == "PLNE" and (entry.scale, ALL_PLANES[entry.plane]) in planes)
+    return sum(entry.stored_length for entry in chosen)
+
+
+def take_over(settled: Mapping[PlaneKey, QuantisedPlane], field: Field) -> None:
+    """Set planes of a field to those that an earlier group has settled, and keep them so."""
+    with torch.no_grad():
+        for (s, name), plane in settled.items():
+            field.plane(s, name)[:] = torch.from_numpy(plane.dequantise())
+    field.freeze(settled)
 
 
 def initialise_from(field: Field, before: Scene) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.cli.grouped import initialise_from
+from kpc.encoder.cli.grouped import initialise_from, take_over
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.read_dataset import PAGE, check_target_size, read_dataset
 from kpc.encoder.cli.report import REFINED, SPACES, describe_model, describe_time_rows, log, show_progress
@@ -29,6 +29,7 @@ from kpc.encoder.field.bounds import (
 )
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.occupancy_grid import grid_shape
+from kpc.encoder.rdo.sharing import Sharing
 from kpc.encoder.training.moving_area import MovingArea, find_moving_area
 from kpc.encoder.training.temporal_resolution import fit_frames_per_row
 from kpc.encoder.training.tight_bounds import trim_box
@@ -64,6 +65,7 @@ class Setting:
         sound_from: the track that it is from, as --audio names it.
         refined: what of the cameras an earlier group of the clip has refined.
         layers: what `find_layers` found for all groups of the clip; None to find it for this dataset.
+        sharing: planes that the groups of the clip share; None for none.
     """
 
     dataset: Dataset
@@ -76,6 +78,7 @@ class Setting:
     sound_from: str = Options.audio
     refined: str = "none"
     layers: Layers | None = None
+    sharing: Sharing | None = None
 
 
 @contextlib.contextmanager
@@ -167,10 +170,13 @@ def prepare_trainer(options: Options, setting: Setting) -> Trainer:
     trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s, mapping=mapping, moving=moving)
     log(*describe_model(trainer).split("\n"))
     changed = ""
+    if setting.before is not None:
+        initialise_from(trainer.field, setting.before)
+    if setting.sharing is not None and setting.sharing.reach is not None:
+        take_over(setting.sharing.settled, trainer.field)
+        trainer.grid.restrict(setting.sharing.reach)
     if resumes:
         changed = trainer.resume(checkpoint, options.time_budget_s)
-    elif setting.before is not None:
-        initialise_from(trainer.field, setting.before)
     if options.resume:
         log(f"resumed at step {trainer.step}" if trainer.step else f"{checkpoint}: no checkpoint yet; starting afresh")
     if changed:

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from kpc.encoder.cli.grouped import options_of_group
 from kpc.encoder.cli.options import Options
+from kpc.encoder.cli.shared_in_file import SharedInFile
 from kpc.encoder.cli.work_folder import is_own_file
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.rdo import codec_model
@@ -97,20 +97,25 @@ def _transcode_groups(options: Options, source: groups.Groups) -> dict[str, Any]
     """Code each group on its own. All coded groups are in memory together."""
     spans, parts, found, is_copy = source.timeline.spans, [], [], True
     clip = _with_history(source.metadata(), options)
-    trades = [options_of_group(options, number, spans).trade for number in range(len(spans))]
+    shared = SharedInFile.find(source)
     copied = with_metadata(options.source, _with_members(source.metadata(), options))
-    if options.trade.target_bytes is not None and len(copied) <= options.trade.target_bytes:
-        trades = [options.trade] * len(spans)  # all groups fit, however their sizes differ
+    # All groups fit then, however their sizes differ.
+    fits = options.trade.target_bytes is not None and len(copied) <= options.trade.target_bytes
+
+    def trade_of(number: int, alone: bool = False) -> Trade:
+        return options.trade if fits else shared.trade_of(options, number, spans, alone)
+
     if options.trade.target_bytes is not None:  # a size that is too small for a late group is refused at once, too
-        for number, trade in enumerate(trades):
-            codec_model.check_size(scene_io.read(source.open(number)), trade, is_coded=True)
-    for number, (span, trade) in enumerate(zip(spans, trades, strict=True)):
-        reader = source.open(number)
+        for number in range(len(spans)):
+            codec_model.check_size(scene_io.read(source.open(number)), trade_of(number, alone=True), is_coded=True)
+    for number, span in enumerate(spans):
+        reader, trade = source.open(number), trade_of(number)
         metadata = _with_history(reader.metadata(), options)
         scene = replace(scene_io.read(reader), cameras=reader.cameras() or source.cameras(), metadata=metadata)
         notice(f"group {number} of {len(spans)}")
-        model = replace(codec_model.model_from_file(scene), shown=True)
+        model = replace(codec_model.model_from_file(scene), shown=True, sharing=shared.of_group(number))
         coded = codec_model.code(model, trade, TrainConfig().prune_share, _tune_steps(options))
+        shared.settle(number, coded)
         is_copy = is_copy and coded.scene is model.coded
         parts.append(groups.GroupInput.of(coded.data, span.start))
         found.append(coding_figures(coded, coded.size_bytes, trade, EVALUATED_ON[1]))

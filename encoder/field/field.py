@@ -6,7 +6,7 @@ optimiser and the priors (`kpc.encoder.field.priors`) see one array. `kpc.encode
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -55,7 +55,7 @@ class Field(nn.Module):
             on the direction only as far as the pictures ask for it.
         axes, sizes, first, areas: constants of `features`: the axes, sizes and first texels of the planes, and
             `Layout.areas`.
-        border: elements of theta that stay 0, `clear_border`.
+        border: elements of theta that stay 0, `restore_fixed`.
     """
 
     axes: Tensor
@@ -108,7 +108,8 @@ class Field(nn.Module):
         self._constant("first", torch.from_numpy(np.where(table < 0, layout.size, table) // layout.channels))
         self._constant("areas", torch.from_numpy(layout.areas))
         self._constant("border", torch.from_numpy(border_elements(layout)))
-        self.clear_border()
+        self._frozen: list[tuple[int, str, Tensor]] = []
+        self.restore_fixed()
         self._make_decoder(layout.features, hidden, uniform)
 
     def _constant(self, name: str, values: Tensor) -> None:
@@ -222,10 +223,18 @@ class Field(nn.Module):
         features = self.combine(planes)  # each plane: (N, S, M)
         return (features if inside is None else features * inside).flatten(1)
 
-    def clear_border(self) -> None:
-        """Set the outermost texels of areas to 0, so that nothing jumps where they end."""
+    def freeze(self, planes: Iterable[tuple[int, str]]) -> None:
+        """Keep planes, by scale and name, as they are now: `restore_fixed` sets them back."""
+        self._frozen = [(s, name, self.plane(s, name).detach().clone()) for s, name in planes]
+
+    def restore_fixed(self) -> None:
+        """Set back what training must not change: frozen planes, and the outermost texels of areas to 0, so that
+        nothing jumps where they end.
+        """
         with torch.no_grad():
             self.theta[self.border] = 0
+            for s, name, values in self._frozen:
+                self.plane(s, name).copy_(values)
 
     def to_scene(
         self,

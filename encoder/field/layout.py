@@ -108,10 +108,14 @@ class Layout:
 
     @property
     def lined_planes(self) -> list[tuple[int, int, int]]:
-        """(start, rows, columns) of each plane that `kpc.encoder.training.line_steps` concerns: of scales without
-        space-time planes, where others have some."""
-        is_lined = self.is_dynamic & (self.resolution[:, 3] == 0)
-        return [(start, rows, columns) for s, _, start, rows, columns in self.planes() if is_lined[s]]
+        """(start, rows, columns) of each plane that `kpc.encoder.training.line_steps` concerns: those of the
+        `still_scales`."""
+        return [(start, rows, columns) for s, _, start, rows, columns in self.planes() if s in self.still_scales]
+
+    @property
+    def still_scales(self) -> tuple[int, ...]:
+        """The scales without space-time planes, where others have some."""
+        return tuple(np.flatnonzero(self.is_dynamic & (self.resolution[:, 3] == 0)).tolist())
 
     @property
     def lines(self) -> int:

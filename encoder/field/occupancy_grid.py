@@ -78,6 +78,14 @@ class OccupancyGrid:
         self._dense = np.ones((1, *visible.shape), bool)
         self._is_sampled = False
 
+    def restrict(self, cells: np.ndarray) -> None:
+        """Let no cells be occupied but these, (Nz, Ny, Nx) bool."""
+        self.visible = self.visible & cells
+        self.occupied &= cells
+        if self.kept is not None:
+            self.kept = self.kept & cells
+        self._activate()
+
     def update(self, density_at: DensityAt, peaks: np.ndarray, rng: np.random.Generator) -> None:
         """Update the occupied cells.
 

@@ -5,9 +5,9 @@ scene as it was coded, and is judged by its own pictures.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +40,7 @@ from kpc.encoder.rdo.rate_control import (
 )
 from kpc.encoder.rdo.rate_search import TOLERANCE
 from kpc.encoder.rdo.sequential_finetune import quantise_sequentially, step_factors
+from kpc.encoder.rdo.sharing import Sharing
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, bfloat16_ceil, round_decoder
 from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.common.progress import Progress
@@ -67,6 +68,7 @@ class Model:
         shown: whether to show the progress of measuring and coding it.
         effort: share of the usual rays on which errors are estimated. Below 1, fewer modes are tried, too, and the
             target is met less closely.
+        sharing: planes that the scene shares with other groups of a clip; None for a scene by itself.
     """
 
     scene: Scene
@@ -74,6 +76,7 @@ class Model:
     coded: QuantisedScene | None = None
     shown: bool = False
     effort: float = 1.0
+    sharing: Sharing | None = None
 
     @cached_property
     def curvature(self) -> Curvature:
@@ -175,7 +178,8 @@ class Selection:
         return replace(chosen, scene=coarser, bits=choose_decoder_bits(coarser, measure, DECODER_SHARE * mse))
 
     def _prune(self, model: Model, measure: Measure) -> "Selection":
-        pruned = prune(self.scene, model.validation.rays, lambda scene: measure(scene).psnr, self.spare_db)
+        whole = None if model.sharing is None else model.sharing.scales
+        pruned = prune(self.scene, model.validation.rays, lambda scene: measure(scene).psnr, self.spare_db, whole)
         if self.coded is not None and not pruned.removed_any:
             return replace(self, pruned=pruned)
         return replace(
@@ -207,6 +211,16 @@ class _Coder:
     @cached_property
     def uncoded_psnr(self) -> float:
         return self.measure(self.model.scene).psnr
+
+    @cached_property
+    def settled(self) -> Mapping[PlaneKey, QuantisedPlane]:
+        return {} if self.model.sharing is None else self.model.sharing.settled
+
+    @property
+    def keeps_settled(self) -> bool:
+        """Whether the file that is coded again, if there is one, holds the planes that are settled."""
+        coded, sharing = self.model.coded, self.model.sharing
+        return coded is None or sharing is None or sharing.is_kept_by(coded)
 
     def select(self) -> Selection:
         """Select what of the model is to be coded."""
@@ -254,17 +268,19 @@ class _Coder:
             if self.quantise is not None:
                 quantised = self.quantise(scene, steps, looked_up, significant)
             else:
-                progress.extend(sum(map(len, scene.scales)) if only is None else len(only))
-                quantised = quantise_by_cost(
+                planes = [(s, name) for s, scale in enumerate(scene.scales) for name in scale]
+                wanted = [key for key in planes if key not in self.settled and (only is None or key in only)]
+                progress.extend(len(wanted))
+                search = partial(
+                    quantise_by_cost,
                     scene,
                     steps,
-                    looked_up,
-                    significant,
-                    only,
-                    chosen.correlation,
+                    significant=significant,
+                    correlation=chosen.correlation,
                     block_sides=BLOCK_SIDES if self.model.effort == 1 else BLOCK_SIDES[:1],
                     done=progress.advance,
                 )
+                quantised = self._search(search, looked_up, wanted)
             return replace(quantised, decoder=round_decoder(quantised.decoder, chosen.bits))
 
         def tune(steps: PerPlane, looked_up: np.ndarray) -> QuantisedScene:
@@ -278,7 +294,9 @@ class _Coder:
             def quantise_group(candidate: Scene, group: Sequence[PlaneKey]) -> QuantisedScene:
                 return quantise(candidate, steps, looked_up, chosen.significant, group)
 
-            return quantise_sequentially(chosen.scene, self.model.scene, quantise_group, tune_steps, self.model.shown)
+            return quantise_sequentially(
+                chosen.scene, self.model.scene, quantise_group, tune_steps, self.model.shown, self.settled
+            )
 
         controller = RateController(
             chosen.scene,
@@ -286,12 +304,30 @@ class _Coder:
             chosen.significant,
             self.measure,
             self.uncoded_psnr,
-            chosen.coded,
+            chosen.coded if self.keeps_settled else None,
             quantise,
             tune if tune_steps else None,
             own_steps=self.model.coded is not None,
         )
         return controller.meet(self.trade, tolerance)
+
+    def _search(
+        self, search: Callable[..., QuantisedScene], looked_up: np.ndarray, wanted: Collection[PlaneKey]
+    ) -> QuantisedScene:
+        """Quantise a scene with its settled planes; those that later groups share are to hold where these need them."""
+        sharing = self.model.sharing
+        if sharing is None:
+            return search(looked_up=looked_up, only=wanted)
+        quantised = search(looked_up=looked_up, only=[key for key in wanted if key not in sharing.planes])
+        shared = dict(self.settled)
+        if own := [key for key in wanted if key in sharing.planes]:
+            wide = search(looked_up=looked_up | sharing.cells, only=own, stores_maps=True)
+            shared |= {(s, name): replace(wide.scales[s][name], stores_map=True) for s, name in own}
+        scales = tuple(
+            {name: shared.get((s, name), plane) for name, plane in scale.items()}
+            for s, scale in enumerate(quantised.scales)
+        )
+        return replace(quantised, scales=scales)
 
     def coded(self, found: Attempt, pruned: Pruned | None = None, spare_db: float = 0.0) -> CodedModel:
         """Return the coded model that an attempt made; the other arguments as in `CodedModel`."""
@@ -324,7 +360,9 @@ def code(
     """
     check_size(model.scene, trade, is_coded=model.coded is not None)
     coder = _Coder(model, trade, prune_share, tune_steps, quantise, grids)
-    unchanged = None if model.coded is None else Attempt(model.coded, coder.measure, 0.0)
+    unchanged = None
+    if model.coded is not None and coder.keeps_settled:
+        unchanged = Attempt(model.coded, coder.measure, 0.0)
     if unchanged is not None and trade.target_bytes is not None and unchanged.size_bytes <= trade.target_bytes:
         return coder.coded(unchanged)  # no other is better
     chosen = coder.select()

@@ -44,6 +44,7 @@ def quantise_by_cost(
     correlation: PerPlane | None = None,
     low_rate_bits: float = LOW_RATE_BITS,
     block_sides: Sequence[int] = BLOCK_SIDES,
+    stores_maps: bool = False,
     done: Callable[[], None] = lambda: None,
 ) -> QuantisedScene:
     """Quantise a scene as `quantise_scene` does, with symbols of least cost.
@@ -58,6 +59,7 @@ def quantise_by_cost(
         correlation: as in `kpc.encoder.rdo.curvature.Curvature`. None for independent channels.
         low_rate_bits: as for `kpc.encoder.rdo.trellis.trellis_quantise`.
         block_sides: sides of transform blocks that are tried; none for the trellis alone.
+        stores_maps: whether the planes are to store their texel maps, though the occupancy implies them.
         done: called after each plane.
     """
     looked_up = looked_up_cells(scene) if looked_up is None else looked_up
@@ -82,9 +84,10 @@ def quantise_by_cost(
         if not block_sides:
             return plane.on_trellis()
         needed = needed_texels(looked_up, name, *values.shape[:2])
-        if looked_up is scene.occupancy:
-            return cheapest_mode(plane, needed, needed, block_sides)
-        return cheapest_mode(plane, needed_texels(scene.occupancy, name, *values.shape[:2]), needed, block_sides)
+        implied = None if stores_maps else needed
+        if looked_up is not scene.occupancy and not stores_maps:
+            implied = needed_texels(scene.occupancy, name, *values.shape[:2])
+        return cheapest_mode(plane, implied, needed, block_sides)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the searches release the GIL
         searched = {}
@@ -128,7 +131,9 @@ class Plane:
             self.low_rate_bits,
         )
 
-    def in_blocks(self, side: int, implied: np.ndarray, needed: np.ndarray | None) -> tuple[QuantisedPlane, int] | None:
+    def in_blocks(
+        self, side: int, implied: np.ndarray | None, needed: np.ndarray | None
+    ) -> tuple[QuantisedPlane, int] | None:
         return transform_quantise(
             self.nearest,
             self.values,
@@ -143,13 +148,13 @@ class Plane:
 
 
 def cheapest_mode(
-    plane: Plane, implied: np.ndarray, needed: np.ndarray, block_sides: Sequence[int] = BLOCK_SIDES
+    plane: Plane, implied: np.ndarray | None, needed: np.ndarray, block_sides: Sequence[int] = BLOCK_SIDES
 ) -> QuantisedPlane:
     """Return the plane in the mode of least cost.
 
     Args:
         plane: to be quantised.
-        implied: (H, W) bool, texels that the file's occupancy implies to be coded.
+        implied: (H, W) bool, texels that the file's occupancy implies to be coded; None to store them.
         needed: (H, W) bool, texels that are looked up.
         block_sides: sides of transform blocks that are tried, at least one.
     """
@@ -178,12 +183,12 @@ def cheapest_mode(
     return min(tried, key=lambda one: one[0])[1]
 
 
-def coded_size(plane: QuantisedPlane, identity: bool, implied: np.ndarray) -> int:
+def coded_size(plane: QuantisedPlane, identity: bool, implied: np.ndarray | None) -> int:
     """Return the size of a plane's segments in bytes."""
     segments = [
         (slice(start, stop), side_info_at(plane.side_info, start)) for start, stop in segment_bounds(plane, identity)
     ]
     return sum(
-        len(encode_segment(plane.symbols[own], plane.coded[own], side_info, implied[own]))
+        len(encode_segment(plane.symbols[own], plane.coded[own], side_info, None if implied is None else implied[own]))
         for own, side_info in segments
     )

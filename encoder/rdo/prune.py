@@ -6,7 +6,7 @@ redistributed to the others by least squares over visible points (optimal brain 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,7 +68,13 @@ def max_renderings(features: int) -> int:
     return 3 + math.ceil(math.log2(features))
 
 
-def prune(scene: Scene, rays: Rays, fidelity: Callable[[Scene], float], spare_db: float) -> Pruned:
+def prune(
+    scene: Scene,
+    rays: Rays,
+    fidelity: Callable[[Scene], float],
+    spare_db: float,
+    whole: Collection[int] | None = None,
+) -> Pruned:
     """Remove the direction MLP, then as many channels as possible, within a loss of `spare_db` in all.
 
     Channels are removed in the order of an estimate in closed form (`elimination_order`); their number is found by
@@ -79,6 +85,8 @@ def prune(scene: Scene, rays: Rays, fidelity: Callable[[Scene], float], spare_db
         rays: on which visible points are found.
         fidelity: of a scene, dB.
         spare_db: how much the fidelity may fall.
+        whole: scales that keep all channels, of a scene whose other scales keep at least one; None where all channels
+            of any scale may go.
     """
     assert isinstance(scene.decoder, Decoder)
     before = fidelity(scene)
@@ -95,11 +103,14 @@ def prune(scene: Scene, rays: Rays, fidelity: Callable[[Scene], float], spare_db
     decoder = scene.decoder
     assert isinstance(decoder, Decoder)
     order = elimination_order(decoder, sampled)
+    if whole is not None:
+        order = order[_may_go(scene, order, whole)]
     removable, next_loss_db = 0, math.inf
-    best, too_many = scene, features
+    best, most = scene, len(order) + 1
+    too_many = most
     while too_many - removable > 1:
         # Most often not even one channel can be removed, so that one is tried first.
-        count = (removable + too_many) // 2 if removable or too_many < features else 1
+        count = (removable + too_many) // 2 if removable or too_many < most else 1
         candidate = replace(scene, decoder=redistribute(decoder, sampled, order[:count]))
         candidate_loss = before - fidelity(candidate)
         if candidate_loss <= spare_db:
@@ -246,6 +257,18 @@ def keep_channels(scene: Scene, kept: Sequence[np.ndarray]) -> Scene:
     d = scene.decoder
     decoder = replace(d, density_weight=d.density_weight[features], w2=d.w2[:, features], b2=d.b2[:, features])
     return replace(scene, scales=scales, decoder=decoder)
+
+
+def _may_go(scene: Scene, order: np.ndarray, whole: Collection[int]) -> np.ndarray:
+    """Return which features of an order of elimination may go where some scales keep all channels, and others one."""
+    counts = [scale["xy"].shape[2] for scale in scene.scales]
+    scale_of = np.repeat(np.arange(len(counts)), counts)
+    may_go = ~np.isin(scale_of[order], list(whole))
+    for s, count in enumerate(counts):
+        own = np.flatnonzero(scale_of[order] == s)
+        if len(own) == count:
+            may_go[own[-1]] = False
+    return may_go
 
 
 def _kept(scene: Scene, gone: np.ndarray) -> tuple[np.ndarray, ...]:

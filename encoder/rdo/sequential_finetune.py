@@ -37,15 +37,16 @@ SPREAD = 0.2  # octaves by which the steps of the first planes are coarser, and 
 CodePlanes = Callable[[Scene, Sequence[PlaneKey]], Mapping[PlaneKey, np.ndarray]]
 
 
-def coding_order(scene: Scene) -> list[list[PlaneKey]]:
+def coding_order(scene: Scene, settled: Collection[PlaneKey] = ()) -> list[list[PlaneKey]]:
     """Return the groups of planes in coding order: each kind of space plane alone, finest scales first, then the time
-    planes.
+    planes. Planes that are settled are left out.
     """
     finest_first = scales_by_resolution(scene)[::-1]
     groups = [[(s, name) for s in scales] for scales in finest_first for name in SPACE_PLANES]
     if scene.is_dynamic:
         groups += [[(s, name) for s in scales for name in TIME_PLANES] for scales in finest_first]
-    return groups
+    remaining = ([key for key in group if key not in settled] for group in groups)
+    return [group for group in remaining if group]
 
 
 def scales_by_resolution(scene: Scene) -> list[list[int]]:
@@ -84,14 +85,14 @@ def step_factors(scene: Scene) -> dict[PlaneKey, float]:
     }
 
 
-def total_steps(scene: Scene, steps: int) -> int:
+def total_steps(scene: Scene, steps: int, settled: Collection[PlaneKey] = ()) -> int:
     """Return the steps of one fine-tuning with `steps` per group, and half as many for the decoder alone at the end."""
-    return (len(coding_order(scene)) - 1) * steps + steps // 2
+    return (len(coding_order(scene, settled)) - 1) * steps + steps // 2
 
 
-def steps_per_group(trained: int, scene: Scene, most: int) -> int:
+def steps_per_group(trained: int, scene: Scene, most: int, settled: Collection[PlaneKey] = ()) -> int:
     """Return the steps per group after `trained` steps of training, at most `most`."""
-    return min(most, int(SHARE * trained / (len(coding_order(scene)) - 0.5)))
+    return min(most, int(SHARE * trained / (len(coding_order(scene, settled)) - 0.5)))
 
 
 def quantise_sequentially(
@@ -100,6 +101,7 @@ def quantise_sequentially(
     quantise: Callable[[Scene, Sequence[PlaneKey]], QuantisedScene],
     steps: int,
     shown: bool = False,
+    settled: Mapping[PlaneKey, QuantisedPlane] | None = None,
 ) -> QuantisedScene:
     """Quantise a scene group by group, with fine-tuning in between.
 
@@ -109,22 +111,31 @@ def quantise_sequentially(
         quantise: quantises a scene, of which only the given planes matter.
         steps: of training after each group.
         shown: whether to show progress.
+        settled: planes that are quantised already.
     """
-    settled: dict[PlaneKey, QuantisedPlane] = {}
+    quantised = dict(settled or {})
 
     def code_planes(candidate: Scene, group: Sequence[PlaneKey]) -> dict[PlaneKey, np.ndarray]:
-        quantised = quantise(candidate, group)
-        found = {(s, name): quantised.scales[s][name] for s, name in group}
-        settled.update(found)
+        chosen = quantise(candidate, group)
+        found = {(s, name): chosen.scales[s][name] for s, name in group}
+        quantised.update(found)
         return {key: plane.dequantise() for key, plane in found.items()}
 
-    rest = quantise(code_sequentially(scene, teacher, code_planes, steps, shown), ())
+    known = {key: plane.dequantise() for key, plane in quantised.items()}
+    rest = quantise(code_sequentially(scene, teacher, code_planes, steps, shown, known), ())
     return replace(
-        rest, scales=tuple({name: settled[s, name] for name in scale} for s, scale in enumerate(scene.scales))
+        rest, scales=tuple({name: quantised[s, name] for name in scale} for s, scale in enumerate(scene.scales))
     )
 
 
-def code_sequentially(scene: Scene, teacher: Scene, code_planes: CodePlanes, steps: int, shown: bool = False) -> Scene:
+def code_sequentially(
+    scene: Scene,
+    teacher: Scene,
+    code_planes: CodePlanes,
+    steps: int,
+    shown: bool = False,
+    known: Mapping[PlaneKey, np.ndarray] | None = None,
+) -> Scene:
     """Return a scene of decoded planes, coded group by group with fine-tuning in between, by any plane codec.
 
     Args:
@@ -133,21 +144,26 @@ def code_sequentially(scene: Scene, teacher: Scene, code_planes: CodePlanes, ste
         code_planes: the codec.
         steps: of training after each group; half as many after the last.
         shown: whether to show progress.
+        known: planes that are coded already, as decoded.
     """
-    renderer, groups = SceneRenderer(teacher), coding_order(scene)
-    settled: set[PlaneKey] = set()
-    with Progress("fine-tuning", total=total_steps(scene, steps), unit="steps", shown=shown) as progress:
+    settled = set(known or {})
+    renderer, groups, scene = SceneRenderer(teacher), coding_order(scene, settled), with_planes(scene, known or {})
+    with Progress("fine-tuning", total=total_steps(scene, steps, settled), unit="steps", shown=shown) as progress:
         for number, group in enumerate(groups):
             decoded = code_planes(scene, group)
             settled |= decoded.keys()
-            scales = tuple(
-                {name: decoded.get((s, name), plane) for name, plane in scale.items()}
-                for s, scale in enumerate(scene.scales)
-            )
-            scene = replace(scene, scales=scales)
+            scene = with_planes(scene, decoded)
             group_steps = steps if number < len(groups) - 1 else steps // 2
             scene = _finetune(scene, renderer, settled, group_steps, number, progress)
     return scene
+
+
+def with_planes(scene: Scene, planes: Mapping[PlaneKey, np.ndarray]) -> Scene:
+    """Return a scene with other values in some of its planes."""
+    scales = tuple(
+        {name: planes.get((s, name), plane) for name, plane in scale.items()} for s, scale in enumerate(scene.scales)
+    )
+    return replace(scene, scales=scales)
 
 
 def _finetune(
@@ -155,13 +171,8 @@ def _finetune(
 ) -> Scene:
     """Train all planes that are not settled, and the decoder, to reproduce the teacher's colours."""
     field, optimiser = _field_and_optimiser(scene, steps)
-    theta, M = field.theta.detach().numpy(), field.layout.channels
-    fixed = [
-        slice(start, start + rows * columns * M)
-        for s, name, start, rows, columns in field.layout.planes()
-        if (s, name) in settled or _is_identity(scene, s, name)
-    ]
-    before = [theta[part].copy() for part in fixed]
+    planes = [(s, name) for s, name, *_ in field.layout.planes()]
+    field.freeze((s, name) for s, name in planes if (s, name) in settled or _is_identity(scene, s, name))
     drawn = ValidationRays.through_occupied(scene, RAYS * steps, seed=100 + seed)
     for number in range(steps if len(drawn.times) >= steps else 0):
         rays = [a[number::steps] for a in drawn.rays]
@@ -177,9 +188,7 @@ def _finetune(
             scene.step,
             scene.extent,
         )
-        for part, values in zip(fixed, before, strict=True):
-            theta[part] = values
-        field.clear_border()
+        field.restore_fixed()
         progress.advance()
     scales = tuple(
         {

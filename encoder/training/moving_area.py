@@ -25,8 +25,8 @@ TIMES, FRAMES_APART = 12, 4
 SEEN, MOVING = 0.6, 0.9
 # Added on every side, in shares of the space, besides half the distance between points: nothing moves beyond.
 MARGIN = 0.01
-# An area that fills more of the space than this saves too little.
-LARGEST = 0.5
+# An area that fills more of the space than this leaves next to nothing that stands still.
+LARGEST = 0.9
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,30 @@ class MovingArea:
 
     Attributes:
         box: `TrainConfig.moving_area`.
-        hull: (POINTS, POINTS, POINTS) bool, indexed [z, y, x]: the points that are seen to move.
+        times: (T,) in [0, 1], rising, at which the hull was found.
+        hulls: (T, POINTS, POINTS, POINTS) bool, indexed [t, z, y, x]: the points that are seen to move at each.
     """
 
     box: tuple[float, ...]
-    hull: np.ndarray
+    times: np.ndarray
+    hulls: np.ndarray
 
     def cells(self, shape: tuple[int, int, int]) -> np.ndarray:
-        """Return the cells of a grid of (Nz, Ny, Nx) cells that lie in the hull or beside it, bool."""
+        """Return the cells of a grid of (Nz, Ny, Nx) cells that lie in a hull or beside it, bool."""
         at = np.ix_(*(((np.arange(count) + 0.5) / count * POINTS).astype(int) for count in shape))
-        cells: np.ndarray = dilate(self.hull)[at]
+        cells: np.ndarray = dilate(np.asarray(self.hulls.any(0)))[at]
         return cells
+
+    def between(self, start: float, end: float) -> "MovingArea":
+        """Return the same area with the hulls from one time to another, and the next one before and after.
+
+        What moves may be anywhere between where it is seen at one time and at the next.
+        """
+        first = max(int(np.searchsorted(self.times, start, side="right")) - 1, 0)
+        last = min(int(np.searchsorted(self.times, end)), len(self.times) - 1)
+        own = slice(first, last + 1)
+        times = np.clip((self.times[own] - start) / max(end - start, 1e-9), 0, 1)
+        return MovingArea(self.box, times, self.hulls[own])
 
 
 def find_moving_area(dataset: Dataset, aabb: np.ndarray, mapping: SpaceMapping | None) -> tuple[MovingArea | None, str]:
@@ -63,8 +76,8 @@ def find_moving_area(dataset: Dataset, aabb: np.ndarray, mapping: SpaceMapping |
     if not has_static_cameras(dataset):
         return None, "cameras move, or show one picture each"
     points = cell_centres((POINTS, POINTS, POINTS))
-    is_hull = _hull(dataset, world_points(points, aabb, mapping))
-    hull = points[is_hull]
+    times, hulls = _hulls(dataset, world_points(points, aabb, mapping))
+    hull = points[hulls.any(0)]
     if not len(hull):
         return None, "no point is seen to move by several cameras"
     margin = MARGIN + 0.5 / POINTS
@@ -73,31 +86,32 @@ def find_moving_area(dataset: Dataset, aabb: np.ndarray, mapping: SpaceMapping |
     if share > LARGEST:
         return None, f"things move in {share:.0%} of the space"
     box = tuple(np.concatenate([low, high]).round(4).tolist())
-    return MovingArea(box, is_hull.reshape(POINTS, POINTS, POINTS)), f"things move in {share:.0%} of the space"
+    return MovingArea(box, times, hulls.reshape(-1, POINTS, POINTS, POINTS)), f"things move in {share:.0%} of the space"
 
 
-def _hull(dataset: Dataset, points: np.ndarray) -> np.ndarray:
-    """Return whether points (N, 3) lie in what moves, at any of several times: (N,) bool."""
+def _hulls(dataset: Dataset, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return several times, (T,), and whether points (N, 3) lie in what moves at each: (T, N) bool."""
     pictures, moving, pinholes = dataset.pictures, MovingPixels(dataset), covering_pinholes(dataset.pictures)
     train = np.flatnonzero(~pictures.is_test)
     cameras, times = np.unique(pictures.camera[train]), np.unique(pictures.time[train])
     count = min(max(TIMES, -(-len(times) // FRAMES_APART)), len(times))
     times = times[np.linspace(0, len(times) - 1, count).round().astype(int)]
-    seen = np.zeros((len(times), len(points)), np.int32)
-    moves = np.zeros_like(seen)
+    seen = np.zeros(len(points), np.uint16)
+    moves = np.zeros((len(times), len(points)), np.uint16)
     for camera in progress(cameras, "finding where things move", unit="cameras"):
         own = train[pictures.camera[train] == camera]
-        for k, time in enumerate(times):
-            number = int(own[np.argmin(np.abs(pictures.time[own] - time))])
+        numbers = [int(own[np.argmin(np.abs(pictures.time[own] - time))]) for time in times]
+        if (mask := moving.mask(numbers[0])) is None:
+            continue
+        pose, pinhole = pictures.camera_to_world[numbers[0]], pinholes[numbers[0]]
+        is_seen, row, column = _project(points, pose, pinhole, mask.shape)
+        seen += is_seen
+        for k, number in enumerate(numbers):
             mask = moving.mask(number)
-            if mask is None:
-                continue
-            is_seen, row, column = _project(points, pictures.camera_to_world[number], pinholes[number], mask.shape)
-            seen[k] += is_seen
+            assert mask is not None
             moves[k] += is_seen & mask[row, column]
     enough = max(2, math.ceil(SEEN * len(cameras)))
-    found: np.ndarray = ((seen >= enough) & (moves >= np.ceil(MOVING * seen))).any(0)
-    return found
+    return times, (seen >= enough) & (moves >= np.ceil(MOVING * seen))
 
 
 def _project(

@@ -216,7 +216,7 @@ class Trainer:
             self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1),
             self.extent,
         )
-        self.field.clear_border()
+        self.field.restore_fixed()
         if not math.isfinite(squared_error):
             raise TrainingError(f"step {self.step}: {self._not_finite()}; try another --seed or --preset")
         if self.cameras is not None and fraction >= config.refine_from:

@@ -128,7 +128,7 @@ def test_a_field_with_an_area_starts_from_another_of_its_layout():
         made = Field(layout, 4, torch.Generator().manual_seed(seed))
         with torch.no_grad():
             made.theta += torch.rand(made.theta.shape, generator=torch.Generator().manual_seed(seed + 9))
-        made.clear_border()
+        made.restore_fixed()
         return made
 
     earlier, later = field(6, 0), field(4, 1)
@@ -222,7 +222,9 @@ def test_groups_share_the_area_in_which_things_move(videos, tmp_path, monkeypatc
 
     def found(dataset: Dataset, aabb: np.ndarray, mapping: None) -> tuple[MovingArea, str]:
         searched.append(dataset.clip.frame_count)
-        return MovingArea((0.3, 0.3, 0.2, 0.8, 0.9, 0.7), np.ones((64, 64, 64), bool)), "so it is"
+        return MovingArea(
+            (0.3, 0.3, 0.2, 0.8, 0.9, 0.7), np.linspace(0, 1, 3), np.ones((3, 64, 64, 64), bool)
+        ), "so it is"
 
     monkeypatch.setattr(prepare, "find_moving_area", found)
     output = tmp_path / "long.kpc"
@@ -233,6 +235,18 @@ def test_groups_share_the_area_in_which_things_move(videos, tmp_path, monkeypatc
         [scale["xy"].symbols.shape[:2] for scale in scene_io.read(opened.open(number)).scales] for number in range(3)
     ]
     assert len(shapes[0]) == 4 and shapes[0] == shapes[1] == shapes[2]
+    first, *others = (scene_io.read(opened.open(number)) for number in range(3))
+    for other in others:  # what stands still is that of the first group
+        for s in (0, 2):
+            assert np.array_equal(other.scales[s]["xy"].symbols, first.scales[s]["xy"].symbols)
+        assert not np.array_equal(other.scales[3]["xy"].symbols, first.scales[3]["xy"].symbols)
+    shared = len(opened.reader.beside)  # but for those of few bytes
+    assert shared and [len(opened.open(number).beside) for number in range(3)] == [shared] * 3
+    smaller = tmp_path / "small.kpc"
+    assert kpenc.main([str(output), "-o", str(smaller), "--quality", "20", "--tune-steps", "0"]) == 0
+    again = Groups(smaller)
+    assert [len(again.open(number).beside) for number in range(3)] == [len(again.reader.beside)] * 3
+    assert again.reader.beside and smaller.stat().st_size < output.stat().st_size
 
 
 def test_an_interrupted_run_resumes_in_its_group_to_the_same_file(videos, tmp_path, monkeypatch, capsys):

@@ -36,7 +36,7 @@ def field() -> Field:
     field = Field(plan_layout(CONFIG, EDGES, CLIP, True), 16, generator)
     with torch.no_grad():
         field.theta += 0.3 * torch.rand(field.theta.shape, generator=generator)
-    field.clear_border()
+    field.restore_fixed()
     return field
 
 
@@ -155,6 +155,11 @@ def test_the_moving_area_holds_what_moves(rolling: Dataset) -> None:
     assert np.prod(high - low) < 0.2 * 4**3
     cells = area.cells((16, 16, 16))
     assert cells[8, 8, 4:12].all() and not cells[:3].any() and not cells[13:].any()
+    early, late = (area.between(*part).cells((16, 16, 16)) for part in ((0.0, 0.4), (0.6, 1.0)))
+    assert early[8, 8, 5] and not early[:, :, 11:].any()  # it moves along x
+    assert late[8, 8, 10] and not late[:, :, :5].any()
+    np.testing.assert_array_equal(area.between(0.0, 1.0).hulls, area.hulls)
+    np.testing.assert_array_equal(area.between(0.6, 1.0).between(0.5, 1.0).hulls, area.between(0.8, 1.0).hulls)
 
 
 def test_cells_where_something_moves_stay_occupied_for_a_part_of_the_run(rolling: Dataset) -> None:
