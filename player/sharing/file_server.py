@@ -14,6 +14,8 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import IO, ClassVar
 
+from kpc.format.common.errors import UsageError
+
 # Bytes sent at a time: few where the rate is limited, so that it is even.
 LIMITED_PIECE_BYTES, PIECE_BYTES = 4096, 1 << 20
 
@@ -156,10 +158,24 @@ def serving(
 ) -> Iterator[str]:
     """Serve a folder to this machine while the context lasts.
 
+    Args:
+        folder: to serve.
+        port: to serve it at; 0 for any that is free.
+        link: that all requests share; None for that of the handler.
+        handler: answers requests.
+
     Yields:
         The URL of the folder, without a slash at its end.
+
+    Raises:
+        UsageError: the given port is in use, or may not be used.
     """
-    server = _Server(("127.0.0.1", port), partial(handler, directory=str(folder), link=link))
+    try:
+        server = _Server(("127.0.0.1", port), partial(handler, directory=str(folder), link=link))
+    except OSError as error:
+        if not port:
+            raise
+        raise UsageError(f"--port {port}: {error.strerror}; choose another port, or 0 for any that is free") from error
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
     thread.start()
     try:

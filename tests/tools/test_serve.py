@@ -116,6 +116,14 @@ def test_the_command_prints_addresses(folder: Path) -> None:
         server.terminate()
 
 
+def test_a_port_in_use_is_reported(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with serving(folder) as url:
+        port = str(urlsplit(url).port)
+        assert serve.main([str(folder), "--port", port]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"serve: --port {port}: ") and "choose another port" in said and said.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     "arguments", [["nowhere"], [".", "--port", "70000"], [".", "--rate", "fast"], [".", "--delay", "1s"]]
 )
