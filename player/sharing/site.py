@@ -237,29 +237,34 @@ def remove_left(folder: Path, written: Collection[Path], sources: Sequence[Path]
     unchanged, others = _left(folder, written, sources)
     for path in unchanged:
         path.unlink()
-    places = dict.fromkeys(path if path.parent == folder else path.parent for path in unchanged)
-    for place in places:
+    removed = dict.fromkeys(unchanged)
+    for place in {path.parent: None for path in unchanged if path.parent != folder}:
         with contextlib.suppress(OSError):  # other files are in it
             place.rmdir()
-    why = "is no longer shared; it stays, since it was changed or is a scene to read"
-    return [f"{place}: is no longer shared, so removed" for place in places] + [f"{path}: {why}" for path in others]
+            removed = dict.fromkeys(place if path.parent == place else path for path in removed)
+    lines = [f"{path}: is no longer shared, so removed" for path in removed]
+    return lines + [f"{path}: is no longer shared; it stays, since it {why}" for path, why in others.items()]
 
 
-def _left(folder: Path, written: Collection[Path], sources: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Return the files that `remove_left` may remove, and those that stay."""
+def _left(folder: Path, written: Collection[Path], sources: Sequence[Path]) -> tuple[list[Path], dict[Path, str]]:
+    """Return the files that `remove_left` may remove, and why the others stay."""
     unchanged: list[Path] = []
-    others: list[Path] = []
+    others: dict[Path, str] = {}
     for name, checksum in _recorded(_text_of(folder / PAGE)).items():
         path, parts = folder / name, name.split("/")
         is_of_site = name != PAGE and len(parts) < 3 and all(part == file_name(part) for part in parts)
         if not is_of_site or path in written or not path.is_file():
             continue
-        if _checksum(path) != checksum or any(path.samefile(source) for source in sources):
-            others.append(path)
-            continue
-        below = _left(path.parent, written, sources) if len(parts) == 2 else ([], [])  # that of a gallery's scene
-        unchanged += [*below[0], path]
-        others += below[1]
+        if len(parts) == 2:  # the page of a gallery's scene, which records what lies beside it, if it was changed, too
+            below = _left(path.parent, written, sources)
+            unchanged += below[0]
+            others |= below[1]
+        if any(path.samefile(source) for source in sources):
+            others[path] = "is one of the scenes to share now"
+        elif _checksum(path) != checksum:
+            others[path] = "was changed after kpshare wrote it"
+        else:
+            unchanged.append(path)
     return unchanged, others
 
 

@@ -260,7 +260,24 @@ def test_what_is_no_longer_shared_is_removed_unless_it_was_changed(
     found = {path.name for path in folder.iterdir()}
     assert found == {"b", "c.kpc", "index.html", "kpc-player.js", "kpc-worker.js", "mine", "page.css", "poster.jpg"}
     assert kpshare.main([str(folder / "c.kpc"), str(scenes / "a.kpc"), "-o", str(folder)]) == 0
-    assert (folder / "c.kpc").exists() and "c.kpc: is no longer shared; it stays" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert (folder / "c.kpc").exists() and "c.kpc: is no longer shared; it stays, since it is one of" in said
+
+
+def test_what_lies_beside_an_edited_page_that_is_no_longer_shared_is_removed(
+    tmp_path: Path, quick_posters: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, page = tmp_path / "site", tmp_path / "site" / "default" / "index.html"
+    shutil.copy(SAMPLE, tmp_path / "a.kpc")
+    assert kpshare.main([str(tmp_path / "a.kpc"), str(SAMPLE), "-o", str(folder)]) == 0
+    page.write_text(page.read_text() + "edited")
+    capsys.readouterr()
+    assert kpshare.main(["--gallery", str(tmp_path), "-o", str(folder)]) == 0
+    assert list(page.parent.iterdir()) == [page] and page.read_text().endswith("edited")
+    lines = {line for line in capsys.readouterr().err.splitlines() if "no longer shared" in line}
+    removed = {f"{page.parent / name}: is no longer shared, so removed" for name in ("default.kpc", "poster.jpg")}
+    stays = f"{page}: is no longer shared; it stays, since it was changed after kpshare wrote it"
+    assert lines == {f"kpshare: {line}" for line in (stays, *removed)}
 
 
 def test_a_scene_that_lay_in_the_folder_is_never_replaced(
