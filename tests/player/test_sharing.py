@@ -318,6 +318,18 @@ def test_what_is_no_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "site").exists()
 
 
+def test_all_scenes_are_checked_before_the_first_poster(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(kpshare, "render_poster", lambda scene: pytest.fail("a poster is rendered"))
+    (tmp_path / "b.kpc").write_bytes(b"no scene")
+    (tmp_path / "c.kpc").write_bytes(SAMPLE.read_bytes()[:30_000])
+    scenes = [str(SAMPLE), *(str(tmp_path / f"{name}.kpc") for name in "abc")]
+    assert kpshare.main([*scenes, "-o", str(tmp_path / "site")]) == 1 and not (tmp_path / "site").exists()
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition(".kpc")[0] for line in lines] == [f"kpshare: {tmp_path / name}" for name in "abc"]
+
+
 def test_a_clip_that_is_damaged_beyond_its_first_group_is_not_published(
     tmp_path: Path, quick_posters: None, capsys: pytest.CaptureFixture[str]
 ) -> None:

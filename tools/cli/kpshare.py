@@ -19,7 +19,7 @@ from urllib.parse import urljoin
 
 import kpc
 from kpc.format.common import cli
-from kpc.format.common.errors import NetworkError, UsageError
+from kpc.format.common.errors import KpcError, NetworkError, UsageError
 from kpc.format.common.images import write_image
 from kpc.format.common.progress import progress
 from kpc.format.common.text import counted, escaped, notice
@@ -60,6 +60,7 @@ def _command(argv: list[str]) -> None:
             site.check_folder(place, {**at_page, **wanted})
 
     check()
+    _check_scenes(files)
     root = "../" if is_gallery else ""
     with _held(folder, files, options), tempfile.TemporaryDirectory() as aside:
         # Nothing is written into the folder if one of the scenes cannot be read, or a poster would replace another.
@@ -141,9 +142,30 @@ def _inputs(options: argparse.Namespace) -> list[Path]:
     return inputs
 
 
+def _check_scenes(files: Sequence[Path]) -> None:
+    """Check all scenes by their checksums, which takes less than a poster of one; print what is wrong with each.
+
+    Raises:
+        KpcError, OSError: what is wrong with the last one that cannot be shared.
+    """
+    faults: list[KpcError | OSError] = []
+    for file in progress(files, "checking", unit="scenes"):
+        try:
+            groups = Groups(file)
+            groups.metadata()
+            check_checksums(groups)
+        except (KpcError, OSError) as error:
+            if cli.message_of(error) is None:
+                raise
+            faults.append(error)
+    for fault in faults[:-1]:
+        cli.print_error("kpshare", cli.message_of(fault) or "")
+    if faults:
+        raise faults[-1]
+
+
 def _read(file: Path, name: str, poster: Path) -> SharedScene:
     """Read a scene, write its poster, and return what its page is to say."""
-    check_checksums(Groups(file))
     loaded = kpc.load(file)
     scene, _ = loaded.at(0.0)
     write_image(poster, render_poster(loaded), POSTER_QUALITY)
