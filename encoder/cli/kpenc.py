@@ -14,9 +14,9 @@ from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group
 from kpc.encoder.cli.options import ALL_VIEWS, Options, parse
 from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer, working_alone
 from kpc.encoder.cli.read_dataset import read_dataset
-from kpc.encoder.cli.report import print_estimate, print_result
+from kpc.encoder.cli.report import log, print_estimate, print_result
 from kpc.encoder.cli.transcode import transcode
-from kpc.encoder.cli.work_folder import leaving_nothing, make_work_folder
+from kpc.encoder.cli.work_folder import has_begun, leaving_nothing, make_work_folder
 from kpc.encoder.evaluation.ablations import effective_ablations
 from kpc.encoder.evaluation.profile import profile
 from kpc.encoder.evaluation.validation_rays import VALIDATION_RAYS
@@ -60,6 +60,8 @@ def encode(options: Options) -> dict[str, Any]:
         KeyboardInterrupt: stopped by the user; the checkpoint is kept.
     """
     with working_alone(options):
+        if options.resume and not has_begun(options.work_dir, in_groups=options.group_s is not None):
+            log(f"{options.work_dir}: there is nothing to resume; starting afresh")
         if options.group_s is not None:
             return encode_groups(options)
         return encode_scene(options, prepare_setting(options))

@@ -177,8 +177,7 @@ def prepare_trainer(options: Options, setting: Setting) -> Trainer:
         trainer.grid.restrict(setting.sharing.reach)
     if resumes:
         changed = trainer.resume(checkpoint, options.time_budget_s)
-    if options.resume:
-        log(f"resumed at step {trainer.step}" if trainer.step else f"{checkpoint}: no checkpoint yet; starting afresh")
+        log(f"resumed at step {trainer.step}")
     if changed:
         log(f"length: {changed}; what is left is trained at the rates of a run of the new length")
     return trainer

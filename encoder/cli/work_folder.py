@@ -1,6 +1,7 @@
 """The work folder of an encode, where decoded pixels and the checkpoint are kept, and the device to train on."""
 
 import contextlib
+import itertools
 import shutil
 from collections.abc import Iterator
 from fnmatch import fnmatch
@@ -77,6 +78,18 @@ def clear_work_folder(work: Path, cache: Path | None = None) -> None:
             leftover.unlink(missing_ok=True)
     shutil.rmtree(work / POSES, ignore_errors=True)
     remove_if_empty(work)
+
+
+def has_begun(work: Path, *, in_groups: bool) -> bool:
+    """Return whether there is something in the work folder with which `--resume` goes on.
+
+    Args:
+        work: the folder; it may be missing.
+        in_groups: whether a clip is encoded in groups, each with a checkpoint of its own, and a report once it is done.
+    """
+    if not in_groups:
+        return (work / CHECKPOINT).exists()
+    return any(itertools.chain(work.glob("group-*.json"), work.glob(f"group-*/{CHECKPOINT}")))
 
 
 def is_own_file(path: Path, work: Path) -> bool:

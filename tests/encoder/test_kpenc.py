@@ -347,9 +347,13 @@ def test_interrupted_while_writing(run: Kpenc, sets: Path, tmp_path: Path, monke
     assert run(sets / "blender", "--steps", "2", "--resume")[0] == 0
 
 
-def test_resume_without_a_checkpoint_starts_afresh(run: Kpenc, sets: Path) -> None:
+def test_resume_without_a_checkpoint_starts_afresh(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+    """The first line says so, before the dataset is read, of a run in groups, too."""
     code, _, err = run(sets / "blender", "--steps", "2", "--resume")
-    assert code == 0 and "starting afresh" in err
+    first = f"{tmp_path / 'out.kpc.work'}: there is nothing to resume; starting afresh\n"
+    assert code == 0 and err.startswith(first)
+    code, _, err = run(tmp_path, "--group", "1s", "--resume")  # a folder without videos
+    assert code == 1 and err.startswith(first)
 
 
 def test_resume_with_other_settings(run: Kpenc, sets: Path, tmp_path: Path) -> None:
