@@ -281,6 +281,12 @@ def test_an_interrupted_run_resumes_in_its_group_to_the_same_file(videos, tmp_pa
     assert output.read_bytes() == (tmp_path / "whole.kpc").read_bytes()
 
 
+def test_that_there_is_nothing_to_resume_is_said_before_the_dataset_is_read(tmp_path, capsys):
+    assert encode(tmp_path, tmp_path / "long.kpc", "--resume") == 1  # there are no videos
+    first = f"{tmp_path / 'long.kpc.work'}: there is nothing to resume; starting afresh\n"
+    assert capsys.readouterr().err.startswith(first)
+
+
 def test_finished_groups_may_have_another_length_but_no_other_options(tmp_path, capsys):
     """As the checkpoint of a single scene and its continuation."""
     path, measured = tmp_path / "group-0000.kpc", (*encode_groups.GROUP_FIGURES, *encode_groups.SUMMED_FIGURES)
