@@ -16,6 +16,7 @@ visible.
     scene = read(groups.open(number)).dequantise()
 """
 
+import itertools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +27,7 @@ import google_crc32c
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import FormatError, UsageError
 from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.common.text import agreeing
 from kpc.format.container.container import ENTRY, HEADER, Codec, Entry, Reader, header_and_index, stored_frame
 from kpc.format.container.metadata_chunk import META_LIMIT, pack_metadata, parse_metadata
 from kpc.format.container.scene_io import SceneReader, read
@@ -355,7 +357,31 @@ def check_parts(parts: Sequence[GroupInput]) -> None:
     try:
         check_spans([part.span for part in parts], [part.source.name for part in parts])
     except FormatError as error:
-        raise UsageError(str(error)) from error
+        raise UsageError(_missing_or_twice(parts) or str(error)) from error
+
+
+def _missing_or_twice(parts: Sequence[GroupInput]) -> str | None:
+    """Return which frames are missing between parts, or which part is given twice; None if neither is so."""
+    for before, after in itertools.pairwise(parts):
+        first, last = before.span.last + 1, after.span.start - 1
+        if first <= last:
+            frames = f"frame {first} is" if first == last else f"frames {first} to {last} are"
+            between = f"between {before.source.name} and {after.source.name}"
+            return (
+                f"{frames} missing {between}; give the part that holds {agreeing(last - first + 1, 'it', 'them')}, too"
+            )
+        if before.span.start < after.span.start and before.span.last < after.span.last:
+            continue
+        by_name: dict[str, GroupInput] = {}
+        by_span: dict[Span, GroupInput] = {}
+        for part in parts:
+            if part.source.name in by_name:
+                return f"{part.source.name}: is given twice; give it once"
+            if part.span in by_span:
+                frames = f"frames {part.span.start} to {part.span.last}"
+                return f"{part.source.name}: holds {frames}, as {by_span[part.span].source.name} does; give one of both"
+            by_name[part.source.name] = by_span[part.span] = part
+    return None
 
 
 def write(parts: Sequence[GroupInput], path: str | os.PathLike[str], metadata: Metadata | None = None) -> int:

@@ -210,14 +210,18 @@ def test_scenes_follow_the_file_before_them(clip, scenes, tmp_path):
 
 
 def test_files_that_do_not_make_up_a_clip_are_refused(clip, scenes, tmp_path, capsys):
-    for name, scene, start in (("early", 0, 0), ("late", 1, 12)):
+    for name, scene, start in (("early", 0, 0), ("middle", 1, 9), ("late", 1, 12), ("copy", 2, 12), ("later", 2, 23)):
         groups.write([GroupInput.of(scenes[scene], start)], tmp_path / f"{name}.kpc")
     slower = tmp_path / "slower.kpc"
     slower.write_bytes(coded(replace(tiny_scene(3, scales=1), clip=Clip(11, 12.5))))
     output = tmp_path / "out.kpc"
     for names, code, complaint in (
-        (["early", "late"], 2, "leave no frame out"),
-        (["late", "late"], 2, "leave no frame out"),
+        (["early", "late"], 2, "frame 11 is missing between "),
+        (["late", "early", "later"], 2, "frame 11 is missing between "),
+        (["early", "early", "middle"], 2, "early.kpc, group 0: is given twice; give it once"),
+        (["late", "late"], 2, "late.kpc, group 0: is given twice; give it once"),
+        (["late", "copy"], 2, "holds frames 12 to 22, as "),
+        (["middle", "later"], 2, "frames 20 to 22 are missing between "),
         (["early"], 2, "give two or more"),
         (["early", "slower"], 2, "runs at 12.5 fps"),
         (["early", "none"], 1, "No such file"),
@@ -232,7 +236,7 @@ def test_files_that_do_not_make_up_a_clip_are_refused(clip, scenes, tmp_path, ca
     before = clip.read_bytes()
     assert kpjoin.main([str(clip), str(slower), "-o", str(clip)]) == 2 and clip.read_bytes() == before
     with pytest.raises(UsageError, match="leave no frame out"):
-        groups.write([GroupInput.of(scenes[0], 5), GroupInput.of(scenes[1], 5)], output)
+        groups.write([GroupInput.of(slower, 5), GroupInput.of(scenes[1], 4)], output)
 
 
 def test_kpinfo_lists_the_groups(clip, capsys):
