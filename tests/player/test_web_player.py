@@ -117,6 +117,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     (folder / "text.kpc").write_text("<!doctype html><title>Not here</title>" * 9)
     (folder / "draft.kpc").write_bytes(data[:10] + bytes(2) + data[12:])
     (folder / "half.kpc").write_bytes(data[:40_000] + bytes(len(data) - 40_000))
+    for name, whole, count in ("stub", "scene", 10_000), ("cut", "scene", 30_000), ("cut-clip", "long", 70_000):
+        (folder / f"{name}.kpc").write_bytes((folder / f"{whole}.kpc").read_bytes()[:count])
     Image.new("RGB", (64, 48), (40, 90, 140)).save(folder / "poster.png")
     with serving(folder, handler=Faulty) as url:
         yield url

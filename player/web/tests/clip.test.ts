@@ -324,11 +324,62 @@ test('a file that is cut off plays as far as it goes', async () => {
   await withServer(cut, {}, async (server) => {
     await withClip(server.url, {}, async (clip) => {
       await until(clip, () => clip.isSettled);
-      assert.ok(clip.notice?.includes('cut off'));
+      const [there, all] = [cut, LONG].map(({ length }) => length.toLocaleString('en'));
+      assert.equal(clip.notice, `cut off at ${there} of ${all} bytes; what is there is played`);
       assert.ok(clip.buffered[0][1] < clip.duration);
       assert.equal(clip.error, null);
     });
   });
+});
+
+test('a clip that is cut off plays without the groups that are not there', async () => {
+  const group = scene({ ...SHORT, frameCount: 101, segmentRows: 32 });
+  const whole = grouped([group, group, group], 101, 11, new Container(group).header.valueCount);
+  const second = new Container(whole).index.filter(({ kind }) => kind === 'GRUP')[1];
+  const planes = new Container(group).index.filter(({ kind }) => kind === 'PLNE');
+  for (const there of [-1, 0, 30, 400, planes[1].offset + 5]) {
+    const cut = whole.slice(0, second.offset + there);
+    for (const faults of [null, {}, { hasRanges: false }, { saysRange: false }]) {
+      const plays = async (clip: Clip) => {
+        await until(clip, () => clip.isSettled && clip.canShow(0));
+        // Where the second group would be blended, where it would be alone, at the end, and back at the beginning.
+        for (const share of [0.33, 0.5, 1, 0]) {
+          const time = share * clip.duration;
+          await until(clip, () => {
+            clip.setPlayhead({ time, rate: 1, loop: share === 1 });
+            return clip.canShow(time) && clip.isSettled;
+          });
+          assert.deepEqual(
+            clip.parts(time).map(({ scene: { group }, share }) => [group, share]),
+            [[0, 1]],
+          );
+        }
+        assert.deepEqual([clip.error, clip.message], [null, null]);
+        assert.ok(clip.notice?.startsWith('cut off'));
+      };
+      if (faults === null) await withClip(cut.buffer, {}, plays);
+      else await withServer(cut, faults, (server) => withClip(server.url, {}, plays));
+    }
+  }
+});
+
+test('what is cut off before there is a picture is refused', async () => {
+  const planes = new Container(LONG).index.filter(({ kind }) => kind === 'PLNE');
+  const cut = LONG.slice(0, planes[2].offset + 1);
+  await assert.rejects(
+    withClip(cut.buffer, {}, async () => {}),
+    hasCode('cut-off'),
+  );
+  await withServer(cut, { hasRanges: false }, async (server) => {
+    const playing = withClip(server.url, {}, (clip) => until(clip, () => false));
+    await assert.rejects(playing, hasCode('cut-off', 'before there is anything to show'));
+  });
+  const clip = grouped([LONG, LONG], 1001, 1, new Container(LONG).header.valueCount);
+  const { offset } = new Container(clip).index[0];
+  await assert.rejects(
+    withClip(clip.slice(0, offset).buffer, {}, async () => {}),
+    hasCode('cut-off'),
+  );
 });
 
 test('what cannot be opened says why', async () => {

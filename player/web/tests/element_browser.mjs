@@ -472,6 +472,7 @@ const WRONG = {
   'text.kpc': ['foreign', /not a \.kpc file/],
   'draft.kpc': ['draft', /draft version/],
   'half.kpc': ['damaged', /damaged/],
+  'stub.kpc': ['cut-off', /incomplete/],
   'refused/scene.kpc': ['blocked', /Access-Control-Allow-Origin: http:\/\/127/],
 };
 
@@ -503,6 +504,27 @@ for (const [src, [code, words]] of Object.entries(WRONG)) {
     await close(page);
   });
 }
+
+scenario('plays what is there of a file that is cut off, and says so', async () => {
+  const warnings = [];
+  const before = (it) => it.on('console', (message) => message.type() === 'warning' && warnings.push(message.text()));
+  for (const src of ['cut.kpc', 'cut-clip.kpc']) {
+    const page = await open(TAG.replace('scene.kpc', src), { before });
+    await shown(page);
+    await until(page, (it) =>
+      it.shadowRoot.querySelector('.notice').textContent.startsWith('This file is incomplete.'),
+    );
+    await player(page, (it) => {
+      it.currentTime = it.duration - 0.1;
+      it.play();
+    });
+    await until(page, (it) => it.ended);
+    assert.equal(await player(page, (it) => it.error), null);
+    assert.match(warnings.pop(), new RegExp(`/${src}: cut off at [0-9,]+ of [0-9,]+ bytes; what is there is played$`));
+    assert.equal(await inside(page, '.notice').isVisible(), true);
+    await close(page);
+  }
+});
 
 scenario('says that there is no WebGL2', async () => {
   const page = await open(TAG, {

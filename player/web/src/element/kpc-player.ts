@@ -9,7 +9,7 @@ import { Ui } from './controls/ui.js';
 import { Fullscreen } from './fullscreen.js';
 import { Input } from './input.js';
 import { momentOf } from './link.js';
-import { CONTEXT_LOST, type PlayerError, playerErrorOf } from './messages.js';
+import { CONTEXT_LOST, INCOMPLETE, type PlayerError, playerErrorOf } from './messages.js';
 import { PageScroll } from './page_scroll.js';
 import { PlayPromises } from './play_promises.js';
 import { PlayerCommands } from './player_commands.js';
@@ -339,6 +339,7 @@ export class KpcPlayer extends AudibleElement implements Model {
         progress: () => this.#progressed(),
         viewChanged: () => this.#emit('camera-change'),
         lost: (isLost) => this.#ui.notify(isLost ? CONTEXT_LOST : '', isLost),
+        incomplete: () => this.#ui.notify(INCOMPLETE, true),
         notified: (message) => this.#ui.notify(message),
         failed: (error) => this.#failed(error),
         frame: () => this.#refresh(),

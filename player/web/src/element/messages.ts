@@ -15,6 +15,7 @@ export interface PlayerError {
 
 export const CONTEXT_LOST =
   'The browser has taken the graphics card away for a moment. The picture comes back by itself.';
+export const INCOMPLETE = 'This file is incomplete. What is there of it is shown.';
 
 /** Return what the property `error` says of something that was thrown. */
 export function playerErrorOf(thrown: unknown, src: string, origin: string): PlayerError {

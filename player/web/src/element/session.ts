@@ -42,6 +42,8 @@ export interface SessionEvents {
   viewChanged(): void;
   lost(isLost: boolean): void;
   failed(error: unknown): void;
+  /** The clip is shown, but the end of its file is missing. */
+  incomplete(): void;
   /** There is something to tell the user, who can go on. */
   notified(message: string): void;
   /** A frame is over. */
@@ -71,6 +73,7 @@ export class Session {
   #isInSight = true;
   #isReduced = false;
   #isSharp = false;
+  #isKnownIncomplete = false;
   #request = 0;
   #lastFrame = 0;
   #shownView: View | null = null;
@@ -303,6 +306,10 @@ export class Session {
     if (pictures > 0 && !this.isShown) {
       this.isShown = true;
       this.#events.shown();
+    }
+    if (this.isShown && clip.notice !== null && !this.#isKnownIncomplete) {
+      this.#isKnownIncomplete = true;
+      this.#events.incomplete();
     }
   }
 

@@ -10,7 +10,7 @@ import { checkGroup } from '../container/groups.js';
 import type { Metadata } from '../container/metadata.js';
 import type { Camera, SceneHead } from '../container/scene_chunks.js';
 import { sharedPlanes } from '../container/shared_planes.js';
-import { groupChunks, groupSpans, Timeline } from '../container/timeline.js';
+import { groupChunks, groupSpans, type Part, Timeline } from '../container/timeline.js';
 import { DecoderPool, type PoolOptions } from '../decoder/pool.js';
 import { type HttpOptions, HttpSource } from './http.js';
 import { openContainer } from './opening.js';
@@ -65,6 +65,8 @@ export class SceneEvent extends Event {
 /** What does not change while a clip is open. */
 interface Opened {
   source: Source;
+  /** Bytes that the source has if it is whole. */
+  fileLength: number;
   pool: DecoderPool;
   ownsPool: boolean;
   timeline: Timeline;
@@ -95,11 +97,14 @@ export class Clip extends EventTarget {
   #opening: { group: number; control: AbortController } | null = null;
   #position: Playhead = { time: 0, rate: 0, loop: true };
   #trouble: string | null = null;
+  /** Groups of which the file, which is cut off, has nothing to show. */
+  readonly #missing = new Set<number>();
   #error: KpcError | null = null;
   #earlierVersions = 0;
   #history: { at: number; received: number }[] = [];
   #isClosed = false;
   #hasReported = false;
+  #hasWarned = false;
 
   private constructor(opened: Opened, first: SceneStream, metadata: Metadata | null) {
     super();
@@ -161,6 +166,7 @@ export class Clip extends EventTarget {
     const kept = pool.memory + (isWhole ? header.fileLength : source.memoryBytes) + (shared?.mostBytes ?? 0);
     const opened: Opened = {
       source,
+      fileLength: header.fileLength,
       pool,
       ownsPool,
       timeline: new Timeline(isSingle ? [{ first: 0, last: 0 }] : groupSpans(index, chunks)),
@@ -203,9 +209,9 @@ export class Clip extends EventTarget {
     if (this.#isClosed) return;
     const share = this.#shareAt(time);
     this.#position = { time: share, rate: this.duration > 0 ? rate / this.duration : 0, loop, isPreview };
-    const { group } = this.timeline.at(share);
+    const { group } = this.#partAt(share);
     if (this.#next?.group === group && this.#canSwitchTo(this.#next)) this.#switch();
-    const blended = this.timeline.blendAt(share).find((part) => part.group !== this.#shown.group)?.group;
+    const blended = this.#blendAt(share).find((part) => part.group !== this.#shown.group)?.group;
     const isWaiting = group !== this.#shown.group;
     const wanted = isWaiting ? group : (blended ?? this.#groupAfter());
     if (this.#next && this.#next.group !== wanted) this.#release();
@@ -224,7 +230,7 @@ export class Clip extends EventTarget {
   parts(time: number): ScenePart[] {
     const share = this.#shareAt(time);
     const parts: ScenePart[] = [];
-    for (const part of this.timeline.blendAt(share)) {
+    for (const part of this.#blendAt(share)) {
       const scene = this.scenes.find(({ group }) => group === part.group);
       if (scene && (scene === this.#shown || scene.holds(part.localTime, part.localTime))) {
         parts.push({ scene, time: part.localTime, share: part.share });
@@ -238,9 +244,9 @@ export class Clip extends EventTarget {
   /** Whether the picture at a time in seconds can be drawn; after a wait, only once the next half second is there. */
   canShow(time: number): boolean {
     const share = this.#shareAt(time);
-    const { group, localTime } = this.timeline.at(share);
+    const { group, localTime } = this.#partAt(share);
     if (group !== this.#shown.group || !this.#shown.canShow(localTime, this.#headIn(group).rate)) return false;
-    return this.error !== null || this.parts(time).length === this.timeline.blendAt(share).length;
+    return this.error !== null || this.parts(time).length === this.#blendAt(share).length;
   }
 
   /** The times that can be drawn, as pairs of seconds. */
@@ -279,14 +285,16 @@ export class Clip extends EventTarget {
   get message(): string | null {
     if (this.error) return `loading stopped: ${this.error.message}`;
     if (this.#trouble) return this.#trouble;
-    const { group, localTime } = this.timeline.at(this.#position.time);
+    const { group, localTime } = this.#partAt(this.#position.time);
     const isWaiting = group !== this.#shown.group || !this.#shown.holds(localTime, localTime);
     return isWaiting ? `loading, ${Math.round(this.bytesPerSecond / 1000)} KB/s` : null;
   }
 
   /** A line about a file whose end is missing; null if it is whole. */
   get notice(): string | null {
-    return this.scenes.some((scene) => scene.isCutOff) ? 'the file is cut off; what is there is played' : null;
+    const { source, fileLength } = this.#opened;
+    if (source.size === null || source.size >= fileLength) return null;
+    return `cut off at ${counted(source.size)} of ${counted(fileLength)} bytes; what is there is played`;
   }
 
   /** Bytes that have come. */
@@ -331,6 +339,12 @@ export class Clip extends EventTarget {
 
   #arrived(): void {
     if (this.#isClosed) return;
+    if (this.#next?.lacksPicture) this.#lose(this.#next.group);
+    if (this.#shown.lacksPicture) this.#error ??= pictureError();
+    if (this.notice !== null && !this.#hasWarned) {
+      this.#hasWarned = true;
+      console.warn(`kpc-player: ${this.#opened.source.name}: ${this.notice}`);
+    }
     this.dispatchEvent(new Event('arrived'));
     if (this.error && !this.#hasReported) {
       this.#hasReported = true;
@@ -338,11 +352,33 @@ export class Clip extends EventTarget {
     }
   }
 
+  /** Return the group shown at a share of the clip, with its own time; the one before, if the file has it not. */
+  #partAt(share: number): Part {
+    let { group } = this.timeline.at(share);
+    while (group > 0 && this.#missing.has(group)) group--;
+    return { group, localTime: this.timeline.localTime(group, share), share: 1 };
+  }
+
+  /** Return the groups in the picture at a share of the clip, as far as the file has them. */
+  #blendAt(share: number): Part[] {
+    const parts = this.timeline.blendAt(share);
+    return parts.some(({ group }) => this.#missing.has(group)) ? [this.#partAt(share)] : parts;
+  }
+
   /** The group after the one that is shown; undefined after the last. */
   #groupAfter(): number | undefined {
-    const count = this.timeline.spans.length;
-    if (this.#shown.group + 1 < count) return this.#shown.group + 1;
-    return this.#position.loop && count > 1 ? 0 : undefined;
+    const { group } = this.#shown;
+    for (let after = group + 1; after < this.timeline.spans.length; after++) {
+      if (!this.#missing.has(after)) return after;
+    }
+    return this.#position.loop && group > 0 ? 0 : undefined;
+  }
+
+  /** Play without a group that the file has not. */
+  #lose(group: number): void {
+    this.#missing.add(group);
+    this.#earlierVersions++;
+    if (this.#next?.group === group) this.#release();
   }
 
   #isNearEnd(): boolean {
@@ -391,7 +427,10 @@ export class Clip extends EventTarget {
       }
     } catch (error) {
       if (!opening.control.signal.aborted && !this.#isClosed) {
-        this.#error = asKpcError(error);
+        const known = asKpcError(error);
+        const isMissing = known.code === 'cut-off' || known.code === 'empty';
+        if (isMissing && group > 0 && this.notice !== null) this.#lose(group);
+        else this.#error = known;
       }
     }
     if (this.#opening === opening) this.#opening = null;
@@ -417,7 +456,9 @@ async function openGroup(
   changed: () => void,
   signal?: AbortSignal,
 ): Promise<SceneStream> {
-  return SceneStream.open(files[group], pool, {
+  const file = files[group];
+  if (file.size === 0 && shared) throw pictureError();
+  const scene = await SceneStream.open(file, pool, {
     group,
     shared,
     memory,
@@ -425,7 +466,14 @@ async function openGroup(
     signal,
     check: ({ head }) => check(group, head),
   });
+  if (!scene.lacksPicture) return scene;
+  scene.close();
+  throw pictureError();
 }
+
+const pictureError = (): FormatError => new FormatError('cut off before there is anything to show', 'cut-off');
+
+const counted = (bytes: number): string => bytes.toLocaleString('en');
 
 /** Return the metadata beside groups; null if there are none, or not yet. */
 async function metadataBeside(

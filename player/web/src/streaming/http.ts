@@ -122,7 +122,8 @@ export class HttpSource implements Source {
       let isWhole = false;
       try {
         const response = await this.#request(connection, start + reached, start + bytes.length, options.fresh ?? false);
-        isWhole = response === null;
+        isWhole = response === null && this.#whole !== null;
+        if (response === null && this.size !== null) bytes = bytes.subarray(0, Math.max(0, this.size - start));
         if (response !== null) {
           let skipped = start + reached - (rangeOf(response)[0] ?? start + reached);
           for await (const piece of connection.pieces(response)) {
@@ -144,14 +145,17 @@ export class HttpSource implements Source {
         failures = reached > before ? 1 : failures + 1;
         await this.#pause(error, failures, options.signal);
       } finally {
-        if (!isWhole) connection.end();
+        if (!isWhole || this.#whole?.isDone) connection.end();
       }
       if (isWhole) return this.#readWhole(start, end, options);
     }
     return bytes;
   }
 
-  /** Return the answer to a request of a range; null if it is the whole file, which then arrives by itself. */
+  /**
+   * Return the answer to a request of a range; null if it is the whole file, which then arrives by itself, or if the
+   * file ends before.
+   */
   async #request(connection: Connection, start: number, end: number, fresh: boolean): Promise<Response | null> {
     const range = `bytes=${start}-${Math.min(end, this.size ?? end) - 1}`;
     const response = await this.#send(connection, { Range: range }, fresh);
@@ -162,7 +166,8 @@ export class HttpSource implements Source {
     }
     const [first, , size] = rangeOf(response);
     if (response.status === 416) {
-      if (this.size !== null) throw this.#replaced();
+      if (this.size !== null && start < this.size) throw this.#replaced();
+      if (this.size !== null) return null; // it has become known since the request was sent
       if (size === 0) throw emptyError(this.name);
       if (size !== null && size < end) {
         this.size = size;

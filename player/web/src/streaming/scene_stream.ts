@@ -308,9 +308,9 @@ export class SceneStream {
     return isHeld && !this.#distances.arePending;
   }
 
-  /** Whether the file ends before the scene does. */
-  get isCutOff(): boolean {
-    return this.#isMissing.includes(true);
+  /** Whether the file ends before the coarsest scale does, so that nothing is there to be seen. */
+  get lacksPicture(): boolean {
+    return this.#segments.some(({ isTime, scale }, position) => !isTime && scale === 0 && this.#isMissing[position]);
   }
 
   /** The share of the bytes of all planes that is held. */
@@ -456,6 +456,7 @@ export class SceneStream {
       await this.#source.read(start, start + length, { signal: request.control.signal, arrived });
       // The server has said meanwhile that the file ends before.
       for (const position of run.slice(done)) this.#isMissing[position] = true;
+      if (done < run.length) this.#changed();
     } catch (error) {
       if (!request.control.signal.aborted) this.#fail(error);
     }

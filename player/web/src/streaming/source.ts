@@ -83,15 +83,20 @@ export class BytesSource implements Source {
 /** A file within a file: a group of a clip. */
 export class SlicedSource implements Source {
   readonly name: string;
-  readonly size: number;
   readonly #whole: Source;
   readonly #offset: number;
+  readonly #length: number;
 
   constructor(whole: Source, offset: number, length: number, name: string) {
     this.name = name;
     this.#whole = whole;
     this.#offset = offset;
-    this.size = whole.size === null ? length : Math.max(0, Math.min(length, whole.size - offset));
+    this.#length = length;
+  }
+
+  get size(): number {
+    const { size } = this.#whole;
+    return size === null ? this.#length : Math.max(0, Math.min(this.#length, size - this.#offset));
   }
 
   get receivedBytes(): number {
