@@ -182,6 +182,20 @@ test('a worker that hangs is ended, its chunk reported, and another takes its pl
   await withPool({ size: 1, spawn }, works);
 });
 
+test('the time that a worker takes to start is not that of its first task', async () => {
+  const spawn: Spawn = (listener) => ({
+    post: (message) => {
+      const { id } = message as { id?: number };
+      if (id === undefined) setTimeout(() => listener.message({ ready: true }), 150);
+      else listener.message({ id, result: null });
+    },
+    terminate: () => {},
+  });
+  await withPool({ size: 1, spawn, deadlineMs: 20 }, async (pool) => {
+    assert.equal(await pool.run(segmentTask(PLANES[0])), null);
+  });
+});
+
 test('a worker that does not start, or breaks down, is reported', async () => {
   await withPool({ size: 1, spawn: spawnScript('throw new Error("no such thing")') }, async (pool) => {
     await assert.rejects(pool.run(segmentTask(PLANES[0])), hasCode('worker', 'no such thing'));

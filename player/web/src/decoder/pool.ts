@@ -32,6 +32,8 @@ export interface RunOptions {
   moved?: Transferable[];
 }
 
+/** Milliseconds that a worker may take to start, on a machine that is busy, too. */
+const STARTING_MS = 20_000;
 /** Bytes that a task takes for each number: symbols in the core and outside, values, and texels. */
 const BYTES_PER_NUMBER = 5;
 
@@ -158,7 +160,7 @@ export class DecoderPool {
         failed: (reason) => this.#lost(slot, port, reason),
       });
       slot.port = port;
-      this.#arm(slot, 0, () => this.#lost(slot, port, 'it does not start'));
+      this.#arm(slot, STARTING_MS, () => this.#lost(slot, port, 'it does not start'));
       port.post({ module, memoryLimit: this.#memory }, []);
     } catch (error) {
       this.#lost(slot, slot.port, String(error));
@@ -166,10 +168,12 @@ export class DecoderPool {
   }
 
   #send(slot: Slot, job: Job): void {
-    this.#arm(slot, job.numbers, (seconds) => {
+    const { deadlineMs = 20_000, deadlineMsPerNumber = 0.01 } = this.#options;
+    const limit = deadlineMs + deadlineMsPerNumber * job.numbers;
+    this.#arm(slot, limit, () => {
       this.#end(slot);
       const what = 'number' in job.task ? `chunk ${job.task.number}` : 'the scene';
-      this.#finish(slot)?.reject(new FormatError(`${what} takes longer than ${seconds} s to decode`));
+      this.#finish(slot)?.reject(new FormatError(`${what} takes longer than ${limit / 1000} s to decode`));
     });
     try {
       slot.port?.post({ id: job.id, task: job.task }, job.moved);
@@ -200,16 +204,14 @@ export class DecoderPool {
     return job;
   }
 
-  /** Call a function, with the limit in seconds, when a worker takes too long for something of so many numbers. */
-  #arm(slot: Slot, numbers: number, late: (seconds: number) => void): void {
-    const { deadlineMs = 20_000, deadlineMsPerNumber = 0.01 } = this.#options;
-    const limit = deadlineMs + deadlineMsPerNumber * numbers;
+  /** Call a function when a worker takes longer for something than `limit` milliseconds. */
+  #arm(slot: Slot, limit: number, late: () => void): void {
     const due = performance.now() + limit;
     clearTimeout(slot.timer);
     slot.timer = setTimeout(() => {
       // A timer that is late shows that the page was suspended, and the worker with it.
-      if (performance.now() > due + 1000) this.#arm(slot, numbers, late);
-      else late(limit / 1000);
+      if (performance.now() > due + 1000) this.#arm(slot, limit, late);
+      else late();
     }, limit);
   }
 
