@@ -223,7 +223,7 @@ class Groups:
 
     def _reader(self, number: int, source: Source) -> Reader:
         """Return a reader of a group, with the planes that it shares in their places."""
-        is_partial = not self.reader.available(self._chunks[number])
+        is_partial = not (self.is_single or self.reader.available(self._chunks[number]))
         if is_partial and source.size < HEADER.size:
             raise FormatError(f"{self.reader.cut_off}: group {number} is not there; fetch the file again")
         reader = Reader(source, allow_partial=is_partial)

@@ -180,7 +180,7 @@ def test_time_rows_are_as_far_apart_as_motion_allows(
     config = replace(TINY, time_tolerance=tolerance, frames_per_row=1.5)
     monkeypatch.setitem(PRESETS, "draft", config)
     for options in (("--keep",), ("--resume",)):
-        code, _, err = run(sets / "n3dv", "--steps", "2", *options)
+        code, _, err = run(sets / "n3dv", "--steps", "2", "--layers", "one", *options)
         (said,) = [line for line in err.splitlines() if line.startswith("time: ")]
         assert code == 0 and f"time: {rows} rows, one for {each} of 4 frames" in said and why in said
         assert len(scene_io.read(tmp_path / "out.kpc").scales[0]["xt"].symbols) == rows
