@@ -414,6 +414,7 @@ export class KpcPlayer extends AudibleElement implements Model {
     this.#clock.pause();
     this.#plays.settle(new DOMException(error.message, 'NotSupportedError'));
     this.#ui.showError(error);
+    console.error(`kpc-player: ${error.detail}`);
     this.#refresh();
     this.#emit('error');
   }

@@ -51,7 +51,7 @@ function sentenceOf(code: PlayerErrorCode, detail: string, src: string, origin: 
       return 'The file is incomplete. Its owner should upload it again.';
     case 'damaged':
     case 'invalid':
-      return `The file is damaged: ${detail}. Its owner should upload it again.`;
+      return 'The file is damaged. Its owner should upload it again.';
     case 'budget':
       return 'This scene needs more memory than the player may use here. Close other pages, or use another device.';
     case 'worker':

@@ -132,7 +132,8 @@ export class Ui {
 
   update(state: UiState): void {
     const { hasControls, isMovable, isShown, isWaiting, paused, ended, isFullscreen, isWhole } = state;
-    this.#bar.hidden = !hasControls;
+    // Of no use beside an error, over whose button it may lie; but it has the button that leaves the full screen.
+    this.#bar.hidden = !hasControls || !(this.#error.hidden || isFullscreen);
     this.stage.classList.toggle('movable', isMovable && isShown);
     this.stage.classList.toggle('whole', isWhole);
     this.stage.tabIndex = isMovable || hasControls ? 0 : -1;
