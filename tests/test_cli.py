@@ -31,6 +31,7 @@ def raising(error: BaseException, cause: BaseException | None = None) -> Callabl
         (FormatError("a\n  b.kpc: cut off"), None, 1, "a\\n  b.kpc: cut off"),
         (UsageError("no such option"), None, 2, "no such option"),
         (OSError(errno.ENOENT, "nothing there", "b.kpc"), None, 1, "b.kpc: nothing there"),
+        (OSError(errno.EISDIR, "Is a directory", "b"), None, 1, "b: is a folder; give the name of a file"),
         (OSError(errno.ENOSPC, "full"), None, 1, "full"),
         (KeyboardInterrupt(), None, 130, "interrupted"),
         (SystemError("compiled"), KeyboardInterrupt(), 130, "interrupted"),
@@ -91,6 +92,15 @@ def test_errors_name_the_file_that_was_asked_for_not_the_one_written_aside(tmp_p
     with pytest.raises(FileNotFoundError) as caught, cli.atomic_write(tmp_path / "a.png") as aside:
         aside.unlink()
     assert caught.value.filename == str(tmp_path / "a.png")
+
+
+def test_outputs_that_cannot_be_made_are_named_as_such(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"cannot be written \(.+\); give another name"):
+        with cli.atomic_write(tmp_path / "none" / "a.png"):
+            pass
+    with pytest.raises(OSError, match=r"cannot be made \(.+\); give another name") as caught:
+        cli.make_folder(tmp_path / ("a" * 1000))
+    assert caught.value.errno == errno.ENAMETOOLONG
 
 
 def test_the_target_of_a_symbolic_link_is_written_and_keeps_its_permissions(tmp_path: Path) -> None:

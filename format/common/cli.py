@@ -86,6 +86,8 @@ def message_of(error: KpcError | OSError) -> str | None:
     if error.filename is None and error.errno not in NO_ROOM:
         return None
     where = f"{escaped(str(error.filename))}: " if error.filename is not None else ""
+    if error.errno == errno.EISDIR:
+        return f"{where}is a folder; give the name of a file"
     return f"{where}{error.strerror or error}"
 
 
@@ -164,7 +166,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         written, mode = file_written(target)
         beginning = target.stem[:60]  # so that a name may be as long as the system permits: four bytes for a letter
-        handle, name = tempfile.mkstemp(prefix=f".{beginning}.", suffix=target.suffix, dir=written.parent)
+        with _naming_output("written", target):
+            handle, name = tempfile.mkstemp(prefix=f".{beginning}.", suffix=target.suffix, dir=written.parent)
         os.close(handle)
         temporary = Path(name)
         yield temporary
@@ -179,6 +182,17 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)  # unless it has been renamed
+
+
+@contextlib.contextmanager
+def _naming_output(done: str, path: Path) -> Iterator[None]:
+    """Say of errors of the system, which may also be of a file that is read, that an output cannot be `done`."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in NO_ROOM:
+            raise
+        raise OSError(error.errno, f"cannot be {done} ({error.strerror}); give another name", str(path)) from error
 
 
 def file_written(path: Path) -> tuple[Path, int]:
@@ -266,10 +280,12 @@ def make_folder(path: Path) -> None:
 
     Raises:
         UsageError: a file has that name.
+        OSError: it cannot be made; the error names `path`.
     """
-    if path.exists() and not path.is_dir():
-        raise UsageError(f"{path}: is a file, not a folder; give another name")
-    path.mkdir(parents=True, exist_ok=True)
+    with _naming_output("made", path):
+        if path.exists() and not path.is_dir():
+            raise UsageError(f"{path}: is a file, not a folder; give another name")
+        path.mkdir(parents=True, exist_ok=True)
 
 
 def input_path(text: str) -> Path:

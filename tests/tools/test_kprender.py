@@ -493,7 +493,8 @@ def test_a_directory_that_cannot_be_written(
 
     monkeypatch.setattr("kpc.format.common.cli.tempfile.mkstemp", refuse)
     code, _, complaint = run(scene_file, "--time", 0, "-o", tmp_path / "x.png", "--backend", "reference")
-    assert code == 1 and complaint.splitlines()[-1] == f"kprender: {tmp_path / 'x.png'}: Permission denied"
+    said = f"{tmp_path / 'x.png'}: cannot be written (Permission denied); give another name"
+    assert code == 1 and complaint.splitlines()[-1] == f"kprender: {said}"
 
 
 def test_without_opengl_the_reference_backend_is_offered(run, scene_file: Path, tmp_path: Path, monkeypatch) -> None:

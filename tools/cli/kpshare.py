@@ -102,7 +102,7 @@ def _held(folder: Path, files: Sequence[Path], options: argparse.Namespace) -> I
     """Make a folder and keep runs with other options out of it; remove what was made if it stays empty."""
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     sources = [[str(file.absolute()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
-    folder.mkdir(parents=True, exist_ok=True)
+    cli.make_folder(folder)
     try:
         with claimed(folder, "kpshare", {"sources": sources, "title": options.title, "url": options.url}):
             yield
