@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -574,6 +575,12 @@ def test_a_scheduler_that_is_killed_is_one_line_and_another_goes_on(
         command = [sys.executable, "-m", f"distributed.cli.{name}", "--scheduler-file", str(address), *words]
         programs.append(subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL))
     scheduler, worker = programs
+
+    def kill_at_step_3() -> None:
+        while worker.poll() is None and not (tmp_path / f"key0.3.{worker.pid}").exists():
+            time.sleep(0.01)
+        scheduler.kill()
+
     try:
         while not address.exists():
             assert scheduler.poll() is None
@@ -584,10 +591,8 @@ def test_a_scheduler_that_is_killed_is_one_line_and_another_goes_on(
         ):
             made = Engine(lambda: client, Place(str(tmp_path)), in_steps)
             made.add(tasks)
-            for _ in made.events():
-                if scheduler.poll() is None and (tmp_path / f"key0.3.{worker.pid}").exists():
-                    scheduler.kill()
-                    scheduler.wait()
+            threading.Thread(target=kill_at_step_3).start()
+            list(made.events())
     finally:
         for program in programs:
             program.kill()
