@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from kpc.format.common.errors import FormatError
 from kpc.format.container.scene_io import read
-from kpc.tools.vectors import fuzz, fuzz_bodies, web_reader
+from kpc.tools.vectors import fuzz, fuzz_bodies, specvectors, web_reader
 from kpc.tools.vectors.files import encode
 from kpc.tools.vectors.scenes import minimal_scene
 from kpc.tools.vectors.web_reader import WebReader
@@ -104,7 +104,9 @@ def test_the_browser_player_reads_or_refuses_what_is_damaged(minimal):
     reader, starts = WebReader(fuzz.WEB_BUDGET), fuzz.seeds("minimal,groups,dynamic")
     try:
         assert reader.examined(minimal, fuzz.HANG_S) == "read"
-        assert reader.examined(minimal[:-1], fuzz.HANG_S) == "read"  # as far as it goes
+        assert reader.examined(minimal[:-1], fuzz.HANG_S) == "FormatError"  # its only scale makes no picture
+        dynamic = specvectors.files()["valid/dynamic.kpc"]
+        assert reader.examined(dynamic[:-1], fuzz.HANG_S) == "read"  # as far as it goes
         assert reader.examined(b"not one", fuzz.HANG_S) == "FormatError"
         said = {reader.examined(fuzz.file_number(1, number, starts), fuzz.HANG_S) for number in range(40)}
         assert said == {"read", "FormatError"}
