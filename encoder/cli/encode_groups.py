@@ -20,7 +20,7 @@ from kpc.encoder.cli.grouped import (
     STILL_SHARE,
     options_of_group,
     plan_sharing,
-    shared_bytes,
+    plane_bytes,
     spans_of,
 )
 from kpc.encoder.cli.metadata import clip_metadata, hash_dataset
@@ -91,7 +91,8 @@ def encode_groups(options: Options) -> dict[str, Any]:
             corrected = with_corrections(setting.dataset, found[0]["corrections"])
             setting = replace(setting, dataset=corrected, refined=found[0]["refine"])
         if number == numbers[0] and setting.sharing is not None:
-            shared = shared_bytes(path, setting.sharing.planes)
+            sizes = plane_bytes(path)
+            shared = sum(sizes[key] for key in setting.sharing.planes)
             setting = replace(setting, sharing=setting.sharing.after(scene_io.read(path)))
     parts = [groups.GroupInput.of(group_path(work, number), spans[number].start) for number in numbers]
     for one in found[1:]:

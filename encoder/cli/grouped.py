@@ -6,7 +6,7 @@ pay, and the figures behind the constants: docs/design/rate-distortion.md, "Grou
 """
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from kpc.format.common.text import agreeing, counted
 from kpc.format.container.container import ENTRY, HEADER
 from kpc.format.container.groups import Span
 from kpc.format.container.scene_io import SceneReader
+from kpc.format.container.scene_layout import PLANE_KIND
 from kpc.format.container.sources import AnySource
 from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, Clip, Scene
 from kpc.format.scene.space import SpaceMapping
@@ -119,11 +120,14 @@ def plan_sharing(
     )
 
 
-def shared_bytes(source: AnySource, planes: Collection[PlaneKey]) -> int:
-    """Return what some planes of a file take, in bytes."""
-    index = SceneReader(source, in_parts=True).index
-    chosen = (entry for entry in index if entry.kind == "PLNE" and (entry.scale, ALL_PLANES[entry.plane]) in planes)
-    return sum(entry.stored_length for entry in chosen)
+def plane_bytes(source: AnySource) -> dict[PlaneKey, int]:
+    """Return what each plane of a file takes, all its segments together, in bytes."""
+    found: dict[PlaneKey, int] = {}
+    for entry in SceneReader(source, in_parts=True).index:
+        if entry.kind == PLANE_KIND:
+            key = entry.scale, ALL_PLANES[entry.plane]
+            found[key] = found.get(key, 0) + entry.stored_length
+    return found
 
 
 def take_over(settled: Mapping[PlaneKey, QuantisedPlane], field: Field) -> None:

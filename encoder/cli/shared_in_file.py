@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kpc.encoder.cli.grouped import options_of_group
+from kpc.encoder.cli.grouped import options_of_group, plane_bytes
 from kpc.encoder.cli.options import Options
 from kpc.encoder.rdo.codec_model import CodedModel
 from kpc.encoder.rdo.distortion import PlaneKey
@@ -79,8 +79,7 @@ class SharedInFile:
 
     def settle(self, number: int, coded: CodedModel) -> None:
         """Take over the planes that a group shares from its coding."""
-        index = scene_io.SceneReader(coded.data).index
-        sizes = {(one.scale, ALL_PLANES[one.plane]): one.stored_length for one in index if one.kind == "PLNE"}
+        sizes = plane_bytes(coded.data)
         for (s, name), place in self.places[number].items():
             self.sizes[place] = sizes[s, name]
             self.settled[place] = coded.scene.scales[s][name]

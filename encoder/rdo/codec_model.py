@@ -41,7 +41,7 @@ from kpc.encoder.rdo.rate_control import (
 from kpc.encoder.rdo.rate_search import TOLERANCE
 from kpc.encoder.rdo.sequential_finetune import quantise_sequentially, step_factors
 from kpc.encoder.rdo.sharing import Sharing
-from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, bfloat16_ceil, round_decoder
+from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, bfloat16_ceil, round_decoder, with_planes
 from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.common.progress import Progress
 from kpc.format.container import scene_io
@@ -323,11 +323,7 @@ class _Coder:
         if own := [key for key in wanted if key in sharing.planes]:
             wide = search(looked_up=looked_up | sharing.cells, only=own, stores_maps=True)
             shared |= {(s, name): replace(wide.scales[s][name], stores_map=True) for s, name in own}
-        scales = tuple(
-            {name: shared.get((s, name), plane) for name, plane in scale.items()}
-            for s, scale in enumerate(quantised.scales)
-        )
-        return replace(quantised, scales=scales)
+        return with_planes(quantised, shared)
 
     def coded(self, found: Attempt, pruned: Pruned | None = None, spare_db: float = 0.0) -> CodedModel:
         """Return the coded model that an attempt made; the other arguments as in `CodedModel`."""

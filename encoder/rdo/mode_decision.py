@@ -9,7 +9,7 @@ levels are 0. What the modes gain: docs/design/rate-distortion.md, "Mode decisio
 import os
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +18,14 @@ from kpc.encoder.rdo.curvature import PerPlane
 from kpc.encoder.rdo.dct_rdo import requested_transform_step, transform_quantise
 from kpc.encoder.rdo.distortion import NO_CORRELATION, PlaneKey, distortion_weights, total_distortion
 from kpc.encoder.rdo.trellis import LOW_RATE_BITS, requested_trellis_step, trellis_quantise
-from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, looked_up_cells, needed_texels, quantise_scene
+from kpc.format.coding.quantise import (
+    QuantisedPlane,
+    QuantisedScene,
+    looked_up_cells,
+    needed_texels,
+    quantise_scene,
+    with_planes,
+)
 from kpc.format.container.segments import TransformSegments, side_info_at
 from kpc.format.scene.scene import TIME_PLANES, Scene
 
@@ -94,11 +101,7 @@ def quantise_by_cost(
         for key, plane in zip(chosen, pool.map(search, chosen), strict=True):
             searched[key] = plane
             done()
-    scales = tuple(
-        {name: searched.get((s, name), plane) for name, plane in scale.items()}
-        for s, scale in enumerate(quantised.scales)
-    )
-    return replace(quantised, scales=scales)
+    return with_planes(quantised, searched)
 
 
 def requested_step(plane: QuantisedPlane) -> np.ndarray:

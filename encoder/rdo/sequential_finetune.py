@@ -23,7 +23,7 @@ from kpc.encoder.field.layout import layout_of_planes
 from kpc.encoder.rdo.distortion import PlaneKey
 from kpc.encoder.training.fused_optimiser import FusedOptimiser
 from kpc.encoder.training.torch_optimiser import TorchOptimiser
-from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, with_planes
 from kpc.format.common.progress import Progress
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 
@@ -156,14 +156,6 @@ def code_sequentially(
             group_steps = steps if number < len(groups) - 1 else steps // 2
             scene = _finetune(scene, renderer, settled, group_steps, number, progress)
     return scene
-
-
-def with_planes(scene: Scene, planes: Mapping[PlaneKey, np.ndarray]) -> Scene:
-    """Return a scene with other values in some of its planes."""
-    scales = tuple(
-        {name: planes.get((s, name), plane) for name, plane in scale.items()} for s, scale in enumerate(scene.scales)
-    )
-    return replace(scene, scales=scales)
 
 
 def _finetune(

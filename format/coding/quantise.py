@@ -9,7 +9,7 @@ of the channel on space planes (read only where nothing is occupied).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -226,6 +226,9 @@ class QuantisedScene:
         return 1.0 - sum(int(c.sum()) for c in changed) / sum(c.size for c in changed) if changed else 1.0
 
 
+AnyScene = TypeVar("AnyScene", Scene, QuantisedScene)
+
+
 def quantise_scene(
     scene: Scene,
     steps: Sequence[Mapping[str, np.ndarray | float]],
@@ -276,6 +279,14 @@ def quantise_scene(
         scene.metadata,
         scene.sound,
     )
+
+
+def with_planes(scene: AnyScene, planes: Mapping[tuple[int, str], Any]) -> AnyScene:
+    """Return a scene with others in place of some of its planes, by scale and name; as numbers or quantised alike."""
+    scales = tuple(
+        {name: planes.get((s, name), plane) for name, plane in scale.items()} for s, scale in enumerate(scene.scales)
+    )
+    return replace(scene, scales=scales)
 
 
 def looked_up_cells(scene: Scene) -> np.ndarray:
