@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import kpc
+from kpc.format.container import groups
 from kpc.format.scene.rig import Rig
 from kpc.player.cpu.reference import render
 from kpc.player.quality import LEVELS
@@ -32,6 +33,15 @@ def test_look_ups_are_those_of_the_samples(tmp_path: Path) -> None:
     assert folded["texels_per_pixel"] < exact["texels_per_pixel"] and folded["psnr"] > 45
     assert exact["cells_per_ray"] >= exact["samples_per_ray"]
     assert {device for record in found.values() for device in record["chosen_on"]} == set(web_bench.DEVICES)
+
+
+def test_the_end_of_the_clip_that_is_sought_in_does_not_come_with_its_beginning() -> None:
+    scene = tiny_scene(4)
+    clip = web_loading.sought_in(coded(scene), scene.clip.frame_count)
+    assert len(clip) > web_loading.SOUGHT_BYTES
+    found = groups.Groups(clip)
+    assert found.timeline.clip.frame_count == scene.clip.frame_count * len(found)
+    assert [entry.kind for entry in found.reader.index] == ["GRUP"] * len(found)
 
 
 def test_the_other_player_shows_as_many_bytes() -> None:
