@@ -104,7 +104,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Print the usage and the error, and exit with 2.
+        """Print the error in one line, with where to read about options, and exit with 2.
 
         A value that begins with a dash, which argparse takes for an option and therefore misses, is named.
         """
@@ -112,7 +112,8 @@ class Parser(argparse.ArgumentParser):
             for option, value in itertools.pairwise(self._words):
                 if self._are_option_and_value(missed[1].split("/"), option, value):
                     message = f"argument {missed[1]}: {value!r} begins with a dash; write {option}={value}"
-        super().error(escaped(message))
+        notice(f"{self.prog}: error: {message} (see {self.prog} --help)")
+        self.exit(2)
 
     def _are_option_and_value(self, names: Sequence[str], option: str, value: str) -> bool:
         """Return whether a word is an option of one of these names, and the next one its value, beginning with a dash.
@@ -237,7 +238,7 @@ def check_writable(path: Path, *, is_folder: bool = False, option: str = "-o") -
 
     Raises:
         UsageError: a folder is missing, is a file, or has the name of the file.
-        OSError: there is no permission to write there, or the file is write-protected; the error names `path`.
+        OSError: nothing can be written there, or the file is write-protected; the error names `path`.
     """
     above = path.absolute()
     if not is_folder:
@@ -258,6 +259,14 @@ def check_writable(path: Path, *, is_folder: bool = False, option: str = "-o") -
         raise UsageError(f"{shown}: no such folder; make it first, or choose another place with {option}")
     if not os.access(above, os.W_OK):
         raise OSError(errno.EACCES, f"no permission to write there; choose another place with {option}", str(path))
+    try:  # some file systems, such as /proc, grant what they do not do
+        with tempfile.TemporaryFile(dir=above):
+            pass
+    except OSError as error:
+        if error.errno in NO_ROOM:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        reason = f"nothing can be written there ({error.strerror}); choose another place with {option}"
+        raise OSError(error.errno, reason, str(path)) from error
 
 
 def refuse_sources(output: Path, *sources: Path, option: str = "-o") -> None:

@@ -5,7 +5,6 @@ capture-overlap.svg    what two neighbours see of one subject, close together an
 capture-clap.svg       a clap in the sound of three cameras, and how much moves, before and after they are in step
 """
 
-import argparse
 import math
 import sys
 from collections.abc import Callable
@@ -30,7 +29,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser("capture_figures", description="Draw the figures of docs/capture.md.")
+    parser = cli.Parser("capture_figures", description="Draw the figures of docs/capture.md.")
     parser.add_argument("folder", type=cli.named_path, help="where the figures are written")
     folder = parser.parse_args(argv).folder
     for name, draw in FIGURES.items():

@@ -15,7 +15,7 @@ def fuzz_parser(name: str, description: str, what: str, count: int) -> argparse.
         what: the inputs that it makes, in the plural.
         count: how many it makes by default.
     """
-    parser = argparse.ArgumentParser(name, description=description)
+    parser = cli.Parser(name, description=description)
     parser.add_argument("--count", type=int, default=count, help=f"number of {what} (default: %(default)s)")
     parser.add_argument("--first", type=int, default=0, help="number of the first of them (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help=f"other {what} (default: %(default)s)")

@@ -220,9 +220,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     default = Options()
-    parser = argparse.ArgumentParser(
-        "scenegen", description="Write the generated default scene: posed videos and ground truth."
-    )
+    parser = cli.Parser("scenegen", description="Write the generated default scene: posed videos and ground truth.")
     cli.add_version_option(parser)
     parser.add_argument("folder", metavar="DIR", help="the folder to write; it is made if need be")
     parser.add_argument(
