@@ -212,16 +212,23 @@ def test_scenes_follow_the_file_before_them(clip, scenes, tmp_path):
 def test_files_that_do_not_make_up_a_clip_are_refused(clip, scenes, tmp_path, capsys):
     for name, scene, start in (("early", 0, 0), ("middle", 1, 9), ("late", 1, 12), ("copy", 2, 12), ("later", 2, 23)):
         groups.write([GroupInput.of(scenes[scene], start)], tmp_path / f"{name}.kpc")
+    (tmp_path / "alone.kpc").write_bytes(scenes[0])
+    for name, digit, start in (("early", "a", 0), ("again", "a", 0), ("other", "b", 11)):
+        of_dataset = Metadata({"provenance": {"dataset_sha256": 64 * digit}})
+        groups.write([GroupInput.of(scenes[0], start)], tmp_path / f"{name}.kpc", of_dataset)
     slower = tmp_path / "slower.kpc"
     slower.write_bytes(coded(replace(tiny_scene(3, scales=1), clip=Clip(11, 12.5))))
     output = tmp_path / "out.kpc"
     for names, code, complaint in (
         (["early", "late"], 2, "frame 11 is missing between "),
         (["late", "early", "later"], 2, "frame 11 is missing between "),
-        (["early", "early", "middle"], 2, "early.kpc, group 0: is given twice; give it once"),
+        (["early", "early", "middle"], 2, "early.kpc: is given twice; give it once"),
         (["late", "late"], 2, "late.kpc, group 0: is given twice; give it once"),
         (["late", "copy"], 2, "holds frames 12 to 22, as "),
         (["middle", "later"], 2, "frames 20 to 22 are missing between "),
+        (["early", "again", "late"], 2, "again.kpc: begins with frame 0, as "),
+        (["early", "alone", "late"], 2, "alone.kpc: is a clip of its own, and "),
+        (["early", "other"], 2, "early.kpc: is of another dataset than "),
         (["early"], 2, "give two or more"),
         (["early", "slower"], 2, "runs at 12.5 fps"),
         (["early", "none"], 1, "No such file"),

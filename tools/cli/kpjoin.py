@@ -51,6 +51,7 @@ def _command(argv: list[str]) -> None:
     cli.refuse_sources(options.output, *options.scenes)
     cli.check_writable(options.output)
     with tempfile.TemporaryDirectory(dir=options.output.parent) as folder:
+        _check_belonging(options.scenes)
         parts = groups.group_inputs(options.scenes)
         groups.check_parts(parts)
         if options.fps is not None:
@@ -63,6 +64,33 @@ def _command(argv: list[str]) -> None:
     if _cameras_differ(options.scenes):
         notice("kpjoin: the files have different cameras; those of the first stand for the clip")
     print(escaped(f"{options.output}: {size:,} bytes, {len(parts)} groups, {duration}"))
+
+
+def _check_belonging(scenes: Sequence[Path]) -> None:
+    """Check that files can be parts of one clip, if one of them begins later than with frame 0, as only a part does.
+
+    Raises:
+        UsageError: another one is a clip of its own, begins with frame 0 as another does, or is of another dataset.
+    """
+    opened = [groups.Groups(scene) for scene in scenes]
+    later = next((one for one in opened if one.timeline.spans[0].start), None)
+    if later is None:
+        return
+    part = f"{later.name} a part of a clip, from frame {later.timeline.spans[0].start} on"
+    first: groups.Groups | None = None
+    for one in opened:
+        if one.is_single:
+            raise UsageError(f"{one.name}: is a clip of its own, and {part}; join the parts of that clip by themselves")
+        if one.timeline.spans[0].start == 0:
+            if first is not None:
+                if one.name == first.name:
+                    raise UsageError(f"{one.name}: is given twice; give it once")
+                both = f"begins with frame 0, as {first.name} does"
+                raise UsageError(f"{one.name}: {both}, and {part}; give one first part only")
+            first = one
+        datasets = [found.metadata().provenance.get("dataset_sha256") for found in (one, later)]
+        if None not in datasets and datasets[0] != datasets[1]:
+            raise UsageError(f"{one.name}: is of another dataset than {later.name}, so they are no parts of one clip")
 
 
 def _cameras_differ(scenes: Sequence[Path]) -> bool:
