@@ -274,12 +274,13 @@ def only_cameras_are_rendered(folder: Path, clip: Clip, capsys: pytest.CaptureFi
 
 
 EARLY, LATE = [n for n in range(FRAMES) if not 4 <= n <= 8], [n for n in range(FRAMES) if not 20 <= n <= 24]
-ALL_STILLS = "12 cameras, 12 pictures of 192x144, 2 held out, static"
-JITTER = "N3DV: 12 cameras, 360 pictures of 192x144, 30 held out (cam00), dynamic, 30 frames at 12.208 fps (2.457 s)"
+ALL_STILLS = "12 cameras, 12 pictures of 192x144, 2 of them held out, static"
+VIDEOS = "N3DV: 12 cameras, {} pictures of {}, {} of them held out (cam00), dynamic, {} frames at {} fps ({} s)"
+JITTER = VIDEOS.format(360, "192x144", 30, 30, 12.208, 2.457)
 
 EXPECTED: dict[str, Outcome] = {
     "c1-one-line-an-image": reads(f"COLMAP: {ALL_STILLS}", stills),
-    "c4-fine": reads(f"COLMAP: {ALL_STILLS}".replace("2 held out", "2 held out (früh (1))"), stills),
+    "c4-fine": reads(f"COLMAP: {ALL_STILLS}".replace("2 of them held out", "2 of them held out (früh (1))"), stills),
     "h1-user-and-password": kpinfo_reads("basic", "user:p%40ss@"),
     "h3-small-file-416": kpinfo_reads("strict", ""),
     "i1-sixteen-bit-grey": reads(f"nerfstudio: {ALL_STILLS}", cameras_are_those_of_the_clip, grey),
@@ -298,23 +299,23 @@ EXPECTED: dict[str, Outcome] = {
     "t7-validation-list": reads(f"nerfstudio: {ALL_STILLS}", stills, first_two_are_held_out),
     "t9-nan-distortion": refused("k1 is NaN"),
     "v1-cut-without-reencoding": reads(
-        "N3DV: 12 cameras, 300 pictures of 192x144, 25 held out (cam00), dynamic, 25 frames at 12 fps (2.083 s)",
+        VIDEOS.format(300, "192x144", 25, 25, 12, 2.083),
         frames(range(5, FRAMES)),
     ),
     "v3-variable-frame-rate": reads(
         JITTER, frames(range(FRAMES), seconds=lambda n: (n * 7500 + 4500 * np.sin(n * 1.7)) / 90000)
     ),
     "v10-odd-but-fine": reads(
-        "N3DV: 12 cameras, 360 pictures of 96x72 to 192x144, 30 held out (cam00), dynamic, 30 frames at 12 fps (2.5 s)",
+        VIDEOS.format(360, "96x72 to 192x144", 30, 30, 12, 2.5),
         films_of_any_kind,
     ),
     "v5-field-order-swapped": reads(
-        "N3DV: 12 cameras, 180 pictures of 192x144, 15 held out (cam00), dynamic, 15 frames at 6 fps (2.5 s)",
+        VIDEOS.format(180, "192x144", 15, 15, 6, 2.5),
         frames(range(0, FRAMES, 2)),
         log="interlaced; deinterlaced",
     ),
     "v8-frames-dropped-at-different-times": reads(
-        "N3DV: 12 cameras, 300 pictures of 192x144, 25 held out (cam00), dynamic, 30 frames at 12 fps (2.5 s)",
+        VIDEOS.format(300, "192x144", 25, 30, 12, 2.5),
         frames(LATE, EARLY),
         log="videos lack frames at different times",
     ),

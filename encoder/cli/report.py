@@ -1,5 +1,6 @@
 """What kpenc prints: log lines on stderr while it runs, and the results on stdout."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -152,6 +153,8 @@ def _print_encode(result: dict[str, Any], options: Options) -> None:
             f"held-out PSNR {result['test_psnr']:.2f} dB{_describe_parts(result)}, SSIM {result['test_ssim']:.4f} over "
             f"{result['test_pictures']} of {counted(result['held_out_pictures'], 'picture')}"
         )
+        if _share_frames(result):
+            quality += " (those of frames that two groups share count twice)"
         if result["appearances"]:
             quality += ", right halves, each in an appearance fitted to its left half"
         if result["refine"] != "none":
@@ -174,6 +177,12 @@ def _print_encode(result: dict[str, Any], options: Options) -> None:
     if result["coding_s"] > result["train_s"]:
         parameters = f"{result['parameters']:,} parameters"
         print(f"coding took longer than training: however few the steps are, all {parameters} are coded")
+
+
+def _share_frames(result: dict[str, Any]) -> bool:
+    """Return whether groups have frames in common, each of which tests its pictures of them."""
+    frames = [group["frames"] for group in result.get("groups", [])]
+    return any(after[0] <= before[1] for before, after in itertools.pairwise(frames))
 
 
 def _describe_parts(result: dict[str, Any]) -> str:

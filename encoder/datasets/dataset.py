@@ -156,7 +156,7 @@ class Dataset:
         parts = [
             f"{self.layout}: {_count(len(self.camera_names), 'camera')}",
             f"{_count(len(p), 'picture')} of {size}",
-            f"{int(p.is_test.sum())} held out{self._held_out()}",
+            f"{int(p.is_test.sum())} of them held out{self._held_out()}",
         ]
         if self.left_out:
             parts.append(f"{_count(self.left_out, 'file')} left out")

@@ -211,7 +211,7 @@ def test_options(run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.Mon
     assert code == 0 and result["test_psnr"] is None and result["test_pictures"] == 0
     assert (result["steps"], result["seed"], result["device"]) == (9, 3, "cpu")
     assert result["box"] == [[-1, -1, -0.5], [1, 1, 0.5]]
-    assert "16x12" in err and "0 held out" in err
+    assert "16x12" in err and "0 of them held out" in err
     assert (tmp_path / "w" / CHECKPOINT).is_file() and any((tmp_path / "w").glob("pixels-*.bin"))
     code, out, _ = run(sets / "n3dv", "--holdout", "cam02", "--test-views", "2", "--steps", "1")
     assert code == 0 and "over 2 of 4 pictures" in out

@@ -415,7 +415,7 @@ def test_the_largest_model_is_read_and_the_others_are_named(tmp_path: Path, caps
     first, second = capsys.readouterr().err.splitlines()
     assert "sparse/1/images.txt (5)" in first and "left out: sparse/0/images.bin (3)" in first
     assert "3 of 8 files found" in second and "images/0000.png, images/0001.png, images/0002.png" in second
-    assert "5 pictures of 32x24, 1 held out (0003), 3 files left out" in dataset.describe()
+    assert "5 pictures of 32x24, 1 of them held out (0003), 3 files left out" in dataset.describe()
 
 
 def test_missing_images_are_asked_for_where_they_are_looked_for(tmp_path: Path) -> None:
@@ -430,7 +430,7 @@ def test_missing_images_are_asked_for_where_they_are_looked_for(tmp_path: Path) 
 def test_other_videos_pictures_and_splits_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make.write_n3dv(tmp_path / "n3dv", frames=1)
     shutil.copy(tmp_path / "n3dv/cam00.mp4", tmp_path / "n3dv/making of.MP4")
-    assert "1 held out (cam00), 1 file left out" in load(tmp_path / "n3dv").describe()
+    assert "1 of them held out (cam00), 1 file left out" in load(tmp_path / "n3dv").describe()
     assert "1 of 4 files found" in (line := said(capsys)) and "making of.MP4" in line
 
     make.write_nerfstudio(tmp_path / "nerfstudio", images=3)

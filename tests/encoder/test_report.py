@@ -23,3 +23,12 @@ def test_the_closing_lines(capsys: pytest.CaptureFixture[str], coding_s: float, 
     assert out.startswith("out.kpc: held-out PSNR 30.00 dB (moving 25.12, still 33.00), SSIM 0.9000 over 4 of 30 pic")
     assert f"of which training 50 s (300 steps) and coding {coding_s:.0f} s; the rest is reading" in out
     assert ("coding took longer than training" in out and "all 80,000 parameters are coded" in out) == why
+
+
+@pytest.mark.parametrize("start, shared", [(14, True), (16, False)])
+def test_pictures_of_frames_that_groups_share_are_said_to_count_twice(
+    capsys: pytest.CaptureFixture[str], start: int, shared: bool
+) -> None:
+    groups = [{"frames": frames, "size_bytes": 2500, "test_psnr": 30.0} for frames in ([0, 15], [start, 29])]
+    print_result(RESULT | {"groups": groups}, Options(Path("clip"), Path("out.kpc")), as_json=False)
+    assert ("4 of 30 pictures (those of frames that two groups share count twice)" in capsys.readouterr().out) == shared

@@ -50,7 +50,7 @@ def test_times_names_and_held_out_cameras(tmp_path: Path) -> None:
     rigs.write_easymocap(tmp_path / "set")
     dataset = load(tmp_path / "set")
     assert dataset.camera_names == ("00", "01", "010") and dataset.pictures.time.tolist() == [0, 1] * 3
-    assert "6 pictures of 40x30, 2 held out (00), dynamic, 2 frames" in dataset.describe()
+    assert "6 pictures of 40x30, 2 of them held out (00), dynamic, 2 frames" in dataset.describe()
     assert load(tmp_path / "set", holdout="010").pictures.is_test.tolist() == [False] * 4 + [True] * 2
     assert not load(tmp_path / "set", holdout="none").pictures.is_test.any()
     fails(tmp_path / "set", "no file is named 'x'", holdout="x")
