@@ -1,5 +1,7 @@
 """Checks of whole windows: how they open, clips in groups, defaults, resets of the graphics card, saved settings."""
 
+import contextlib
+import io
 import shutil
 from collections.abc import Callable
 
@@ -138,13 +140,15 @@ def settings_are_saved(scene_file: str) -> None:
         press(player, "-", "g")
 
     with replaced(Player, run=run):
-        assert kpplay.main([scene_file, "--size", "300x200"]) == 0
+        with contextlib.redirect_stderr(io.StringIO()) as said:
+            assert kpplay.main([scene_file, "--size", "300x200"]) == 0
+        assert said.getvalue() == "kpplay: --size 300x200: a window is at least 640x480, so this one is 640x480\n"
         assert kpplay.main([scene_file, "--target-fps", "25"]) == 0
         assert kpplay.main([scene_file, "--quality", "fine"]) == 0
         shutil.rmtree(preferences_path().parent)
         preferences_path().parent.write_text("not a folder")
         assert kpplay.main([scene_file]) == 0
-    assert [one.size for one in settings[:3]] == [(300, 200), (640, 480), (640, 480)]  # no less is remembered
+    assert [one.size for one in settings[:3]] == [(640, 480)] * 3
     assert [one.graphs for one in settings] == [False, True, False, False]
     assert [one.quality for one in settings] == [DEFAULT, neighbouring_level(DEFAULT, -1), "fine", DEFAULT]
     assert [one.target_fps for one in settings] == [None, 25.0, None, None]

@@ -30,7 +30,7 @@ from kpc.player.app import preferences
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.controls import Playback
 from kpc.player.app.playlist import Playlist
-from kpc.player.app.preferences import TARGET_FPS, WINDOW_SIDES, Preferences
+from kpc.player.app.preferences import MIN_WINDOW, TARGET_FPS, WINDOW_SIDES, Preferences
 from kpc.player.app.resolution_controller import GPU_FPS
 from kpc.player.quality import LEVELS
 
@@ -68,6 +68,8 @@ def _command(argv: list[str]) -> None:
 
     # A run of a fixed number of frames is a test: it neither reads nor writes settings.
     file = preferences.preferences_path() if options.frames is None else None
+    if file is not None and options.size is not None:
+        options.size = _usable_size(options.size)
     settings = _merged(preferences.load(file) if file else Preferences(), options)
     playlist = Playlist.named(options.scenes, settings.recent)
     stream = GroupPlayback(open_source(playlist.files[0], limit=options.memory), memory=options.memory)
@@ -105,7 +107,8 @@ def _parser() -> argparse.ArgumentParser:
         "--size",
         type=_size,
         metavar="WxH",
-        help=f"size of the window (default: as last time; at first {DEFAULT_HEIGHT} high, shaped as the pictures)",
+        help="size of the window, at least {}x{}, or any with --frames (default: as last time; at first {} high, "
+        "shaped as the pictures)".format(*MIN_WINDOW, DEFAULT_HEIGHT),
     )
     parser.add_argument(
         "--memory",
@@ -180,7 +183,7 @@ def _play(
     before: Playback | None = None
     try:
         while True:
-            window.set_title(f"{stream.metadata.title or Path(stream.source.name).name} - kpplay")
+            window.set_title(_title(stream))
             name, is_remote = stream.source.name, isinstance(stream.source, RemoteSource)
             playlist.opened(file, name if is_remote else os.path.abspath(name))
             player = Player(
@@ -226,9 +229,24 @@ def _play(
         window.close()
 
 
+def _title(stream: "GroupPlayback") -> str:
+    """Return the title of the window: that of the scene, which several may have, and the name of its file."""
+    file, title = Path(stream.source.name).name, stream.metadata.title
+    return f"{title} ({file}) - kpplay" if title else f"{file} - kpplay"
+
+
 def _default_size(stream: "GroupPlayback") -> tuple[int, int]:
     camera = Rig.of(stream.scene).cameras[0]
     return min(max(round(DEFAULT_HEIGHT * camera.width / camera.height), MIN_WIDTH), MAX_WIDTH), DEFAULT_HEIGHT
+
+
+def _usable_size(size: tuple[int, int]) -> tuple[int, int]:
+    """Return a size in which nothing is cut off; say so if it is another."""
+    width, height = map(max, size, MIN_WINDOW)
+    if (width, height) != size:
+        given, least = ("{}x{}".format(*one) for one in (size, MIN_WINDOW))
+        notice(f"kpplay: --size {given}: a window is at least {least}, so this one is {width}x{height}")
+    return width, height
 
 
 def _size(text: str) -> tuple[int, int]:

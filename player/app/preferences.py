@@ -19,7 +19,7 @@ from kpc.player.quality import LEVELS
 MAX_BYTES = 1 << 16
 # Width and height of a window, screen units.
 WINDOW_SIDES = range(64, 16385)
-# The smallest (width, height) that is remembered, screen units.
+# The smallest (width, height) of a window in which nothing is cut off, screen units.
 MIN_WINDOW = 640, 480
 # Lowest and highest frame rate to hold.
 TARGET_FPS = (1.0, 240.0)

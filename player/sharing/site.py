@@ -106,7 +106,7 @@ def scene_page(
 
 
 def gallery_page(scenes: Mapping[str, SharedScene], title: str, url: str | None = None) -> str:
-    """Return a page that lists scenes with their posters.
+    """Return a page that lists scenes with their posters, and with their files where several have one title.
 
     Args:
         scenes: by the name of the folder of each one's page.
@@ -118,7 +118,13 @@ def gallery_page(scenes: Mapping[str, SharedScene], title: str, url: str | None 
         place = quote(folder)
         image = f'<img src="{place}/{POSTER}" alt="" loading="lazy">' if scene.has_poster else ""
         first_poster = first_poster or (f"{place}/{POSTER}" if scene.has_poster else None)
-        cards.append(f'<li><a href="{place}/{PAGE}">{image}<h2>{escape(scene.title)}</h2><p>{scene.facts}</p></a></li>')
+        facts = scene.facts
+        alike = [name for name, one in scenes.items() if one.title == scene.title]
+        if len(alike) > 1:
+            files = {scenes[name].name for name in alike}
+            facts = f"{scene.name if len(files) == len(alike) else folder}.kpc, {facts}"
+        head = f"<h2>{escape(scene.title)}</h2><p>{escape(facts)}</p>"
+        cards.append(f'<li><a href="{place}/{PAGE}">{image}{head}</a></li>')
     count = f"{len(scenes)} scene{'s' * (len(scenes) != 1)} to look at from all sides."
     body = _filled("gallery.html", title=escape(title), description=count, cards="\n".join(cards))
     return _page(body, title, count, _preview(first_poster, url))

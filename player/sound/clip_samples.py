@@ -12,6 +12,7 @@ from kpc.format.container.sources import RemoteSource
 from kpc.format.scene.sound import PRE_ROLL, Sound
 from kpc.player.sound.opus import decode
 
+MISSING = "sound is missing, since the file is cut off"
 # Pre-roll of a block that is decoded by itself: so much that nothing is heard of where it begins.
 SEAMLESS = 2 * PRE_ROLL
 HELD_CHUNKS = 4  # of Opus packets, which the blocks that follow one another share
@@ -22,6 +23,9 @@ class ClipSamples:
 
     Args:
         groups: of the file.
+
+    Attributes:
+        notice: MISSING, once samples have been asked for that are not in the file; None before.
     """
 
     def __init__(self, groups: Groups) -> None:
@@ -29,6 +33,7 @@ class ClipSamples:
         self._reader: tuple[int, SceneReader] | None = None
         self._own_source: RemoteSource | None = None
         self._chunks: OrderedDict[tuple[int, int], SoundSegment] = OrderedDict()
+        self.notice: str | None = None
 
     def read(self, first: int, count: int) -> np.ndarray:
         """Return (count, 2) float32: the samples from `first` on, 0 where there are none.
@@ -39,7 +44,9 @@ class ClipSamples:
         found = np.zeros((count, 2), np.float32)
         for span in self._spans:
             begin, stop = max(first, span.first), min(first + count, span.stop)
-            if begin < stop and self._groups.available(span.group):
+            if begin < stop and not self._groups.available(span.group):
+                self.notice = MISSING
+            elif begin < stop:
                 samples = self._of_group(span, begin - span.start, stop - begin)
                 found[begin - first :][: len(samples)] = samples  # one channel is heard on both sides
         return found
@@ -53,16 +60,22 @@ class ClipSamples:
         """Return samples of a group, from its own sample `first` on; fewer at the end of its sound."""
         reader = self._opened(span.group)
         numbers = reader.sound_numbers
-        if not numbers or not reader.available(numbers[0]):
+        if not numbers:
+            return np.zeros((0, 2), np.float32)
+        if not reader.available(numbers[0]):
+            self.notice = MISSING
             return np.zeros((0, 2), np.float32)
         head = self._chunk(span.group, reader, numbers[0])
         low, high = first + head.pre_skip - SEAMLESS, first + head.pre_skip + count
         entries = [reader.index[number] for number in numbers]
-        needed = [
+        wanted = [
             (number, entry.row_start)
             for number, entry in zip(numbers, entries, strict=True)
-            if entry.row_start < high and entry.row_start + entry.row_count > low and reader.available(number)
+            if entry.row_start < high and entry.row_start + entry.row_count > low
         ]
+        needed = [(number, start) for number, start in wanted if reader.available(number)]
+        if len(needed) < len(wanted):
+            self.notice = MISSING
         if not needed or first >= head.sample_count:
             return np.zeros((0, 2), np.float32)
         packets = [packet for number, _ in needed for packet in self._chunk(span.group, reader, number).packets]

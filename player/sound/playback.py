@@ -27,7 +27,13 @@ BLOCK_S, AHEAD_S = 1.0, 3.0
 
 
 class Samples(Protocol):
-    """Where samples come from (`kpc.player.sound.clip_samples.ClipSamples`)."""
+    """Where samples come from (`kpc.player.sound.clip_samples.ClipSamples`).
+
+    Attributes:
+        notice: why some that were asked for are silent, for the user; None if there is no reason.
+    """
+
+    notice: str | None
 
     def read(self, first: int, count: int) -> np.ndarray:
         """Return (count, 2) float32 from sample `first` on."""
@@ -64,6 +70,7 @@ class SoundPlayback:
         self._open_device, self._starts_thread = open_device, starts_thread
         self._queue = SampleQueue(now)
         self._device: Device | None = None
+        self._noticed: str | None = None  # what was said of the samples, once
         self._is_over = False  # there is no device, the sound cannot be decoded, or `close` was called
         self._change = threading.Condition()
         self._next = 0  # the sample of the clip that is decoded next
@@ -115,6 +122,8 @@ class SoundPlayback:
             first = first % self._length if self._loops else first
             count = min(round(BLOCK_S * SAMPLE_RATE), self._length - first)
         samples = self._samples.read(first, count)
+        if self._samples.notice != self._noticed:
+            self.notice = self._noticed = self._samples.notice
         with self._change:
             if start == self._start:  # else it began anew meanwhile
                 self._queue.put(first, samples)

@@ -184,7 +184,7 @@ class GroupPlayback:
 
     @property
     def bytes_per_s(self) -> float:
-        """Bytes that arrived in the last second."""
+        """See `Stream.bytes_per_s`; of all groups that are held."""
         return self.stream.bytes_per_s + (0.0 if self._next is None else self._next.stream.bytes_per_s)
 
     def blended_with(self, time: float) -> tuple[Renderer, float, float] | None:

@@ -43,8 +43,8 @@ RESUME_S = 0.5
 SOUND_BYTES = 1 << 23
 # Bytes that a scene without its planes may take before it is refused, however small --memory is.
 LEAST_BUDGET = 1 << 25
-# Seconds over which the rate of arriving bytes is averaged.
-RATE_OVER_S = 1.0
+# Seconds over which the rate of arriving bytes is averaged: on a slow line they come in lumps that are seconds apart.
+RATE_OVER_S = 5.0
 
 
 @dataclass
@@ -223,10 +223,10 @@ class Stream:
 
     @property
     def bytes_per_s(self) -> float:
-        """Bytes that arrived in the last second."""
+        """Bytes per second, over the last RATE_OVER_S or since it was last asked for, if that is longer."""
         now = clock.monotonic()
         self._history.append((now, self.received))
-        while self._history[0][0] < now - RATE_OVER_S:
+        while len(self._history) > 2 and self._history[1][0] <= now - RATE_OVER_S:
             self._history.popleft()
         (since, before), (until, after) = self._history[0], self._history[-1]
         return (after - before) / (until - since) if until > since else 0.0

@@ -138,6 +138,17 @@ def test_several_scenes_become_a_gallery(tmp_path: Path, quick_posters: None) ->
         assert all((page.parent / address).is_file() for address in Page(page.read_text()).addresses())
 
 
+def test_scenes_of_one_title_are_told_apart_in_a_gallery() -> None:
+    def page(**scenes: SharedScene) -> list[str]:
+        return re.findall(r"<h2>(.*?)</h2><p>(.*?)</p>", site.gallery_page(scenes, "g"))
+
+    vase, other = shared(title="Vase"), replace(shared(title="Vase"), name="other<")
+    facts = vase.facts
+    assert page(a=vase, b=shared(title="Ball")) == [("Vase", facts), ("Ball", facts)]
+    assert page(a=vase, b=other) == [("Vase", f"scene.kpc, {facts}"), ("Vase", f"other&lt;.kpc, {facts}")]
+    assert page(a=vase, b=vase) == [("Vase", f"a.kpc, {facts}"), ("Vase", f"b.kpc, {facts}")]
+
+
 def test_what_is_published_keeps_its_address(
     tmp_path: Path, quick_posters: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

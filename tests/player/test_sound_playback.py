@@ -15,7 +15,7 @@ from kpc.format.scene.sound import SAMPLE_RATE
 from kpc.player.app.controls import Playback
 from kpc.player.sharing.file_server import Handler, serving
 from kpc.player.sound import device
-from kpc.player.sound.clip_samples import ClipSamples
+from kpc.player.sound.clip_samples import MISSING, ClipSamples
 from kpc.player.sound.playback import AHEAD_S, APART_S, SoundPlayback
 from sounds import decoded, scene_with_sound, sweep, write_clip_with_sound
 
@@ -27,6 +27,8 @@ CLIP = Clip(301, 30.0)  # ten seconds
 
 class Ramp:
     """Samples that are their own position."""
+
+    notice = None
 
     def read(self, first: int, count: int) -> np.ndarray:
         return np.repeat(np.arange(first, first + count, dtype=np.float32)[:, None], 2, axis=1)
@@ -210,6 +212,18 @@ def test_samples_of_a_file_are_those_of_a_decoder_that_never_stopped(files):
             error = np.abs(samples.read(first, 3000)[:, 0] - files[2][first : first + 3000])
             assert error.max() < 0.005, (file, first)
         assert not samples.read(4 * SAMPLE_RATE + 10, 100).any()
+
+
+def test_sound_that_was_cut_off_with_its_group_is_missed_once(files):
+    whole = Path(files[1]).read_bytes()
+    samples = ClipSamples(Groups(whole[: len(whole) - 40], allow_partial=True, in_parts=True))
+    bench = Bench(samples=samples)
+    bench.sound.follow(0.0, plays=True, loops=True)
+    assert bench.sound.fill() and bench.sound.notice is None
+    assert bench.sound.fill() and bench.sound.fill() and bench.sound.notice == MISSING
+    bench.sound.notice = None
+    bench.run(2.0)  # so that the rest is asked for, too
+    assert bench.sound.notice is None
 
 
 @pytest.mark.parametrize("has_ranges", [True, False])

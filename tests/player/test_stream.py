@@ -7,6 +7,7 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, ClassVar
 
 import moderngl
@@ -300,6 +301,22 @@ def test_the_window_does_not_wait_for_a_server_that_does_not_answer(
             slowest = max(slowest, clock.monotonic() - started)
         release.set()
     assert slowest < 0.25  # a request would have taken longer
+
+
+def test_the_rate_shown_on_a_slow_line_does_not_fall_to_nothing_between_lumps(
+    watched: Callable[..., Stream], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream, now = watched(coded(tiny_scene(6, dynamic=False))), 0.0
+    monkeypatch.setattr("kpc.player.streaming.stream.clock", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(Stream, "received", property(lambda self: 30_000 * int(now / 3)))  # 10 KB/s, every 3 s
+    stream._history.clear()
+    rates = []
+    for frame in range(300):
+        now = frame / 10
+        rates.append(stream.bytes_per_s)
+    assert 5_000 <= min(rates[100:]) <= max(rates) <= 15_000
+    now = 60.0  # not asked for meanwhile
+    assert stream.bytes_per_s == pytest.approx(10_000, rel=0.1)
 
 
 def test_a_broken_connection_is_reported_and_resumed(watched: Callable[..., Stream], tmp_path: Path) -> None:
