@@ -137,6 +137,25 @@ export function displacementsAt({ sizes, displacements }: MotionGrid, time: numb
   return out;
 }
 
+/** A row of a padded grid: its first cell, and the way to the next cell, row and layer in the direction of a pass. */
+interface GridRow {
+  first: number;
+  width: number;
+  by: number;
+  row: number;
+  layer: number;
+}
+
+/** Make no cell of a row farther than one of the 13 neighbours that a pass has left behind, and one step. */
+function relaxRow(padded: Uint8Array, least: Uint8Array, { first, width, by, row, layer }: GridRow): void {
+  const end = first + by * width;
+  for (let at = first; at !== end; at += by) {
+    const behind = Math.min(least[at - layer - row], least[at - layer], least[at - layer + row]);
+    padded[at] = Math.min(padded[at], 1 + Math.min(padded[at - by], least[at - row], behind));
+  }
+  for (let at = first; at !== end; at += by) least[at] = Math.min(padded[at - 1], padded[at], padded[at + 1]);
+}
+
 /**
  * Return the Chebyshev distance of each cell [z][y][x] to the nearest occupied one, at most 255.
  *
@@ -149,31 +168,19 @@ export function emptyDistances(occupied: Uint8Array, sizes: readonly number[]): 
   const row = width + 2;
   const layer = row * (height + 2);
   const padded = new Uint8Array(layer * (depth + 2)).fill(FARTHEST);
+  const least = padded.slice(); // of each cell and its two neighbours in the row, for rows that a pass is done with
   const cells: number[] = []; // the first cell of each row, in the padded grid
   for (let z = 0; z < depth; z++) {
     for (let y = 0; y < height; y++) cells.push((z + 1) * layer + (y + 1) * row + 1);
   }
-  const before = [-1];
-  for (let x = -1; x <= 1; x++) {
-    before.push(x - row);
-    for (let y = -1; y <= 1; y++) before.push(x + y * row - layer);
-  }
-  const relax = (at: number, direction: number) => {
-    let least = padded[at];
-    for (let i = 0; i < before.length && least > 0; i++) {
-      least = Math.min(least, padded[at + direction * before[i]] + 1);
-    }
-    padded[at] = least;
-  };
   for (const [number, first] of cells.entries()) {
-    for (let x = 0; x < width; x++) {
-      if (occupied[number * width + x]) padded[first + x] = 0;
-      else relax(first + x, 1);
-    }
+    for (let x = 0; x < width; x++) if (occupied[number * width + x]) padded[first + x] = 0;
   }
-  for (const first of [...cells].reverse()) {
-    for (let x = width - 1; x >= 0; x--) relax(first + x, -1);
+  for (const first of cells) relaxRow(padded, least, { first, width, by: 1, row, layer });
+  for (const first of cells.reverse()) {
+    relaxRow(padded, least, { first: first + width - 1, width, by: -1, row: -row, layer: -layer });
   }
+  cells.reverse();
   const out = new Uint8Array(depth * height * width);
   for (const [number, first] of cells.entries()) out.set(padded.subarray(first, first + width), number * width);
   return out;
