@@ -1,10 +1,9 @@
 /** A file whose beginning is requested once: what is read of it is handed on as it arrives. */
 
 import { KpcError } from '../container/errors.js';
-import type { ReadOptions, Source } from './source.js';
+import { ForwardingSource, type ReadOptions, type Source } from './source.js';
 
-export class BegunSource implements Source {
-  readonly #source: Source;
+export class BegunSource extends ForwardingSource {
   readonly #ending = new AbortController();
   readonly #waiting = new Set<() => void>();
   /** Where the beginning ends, and what has come of it. */
@@ -14,30 +13,18 @@ export class BegunSource implements Source {
 
   /** Request the first `length` bytes of a source. */
   constructor(source: Source, length: number) {
-    this.#source = source;
+    super(source);
     this.#end = length;
     this.#begin();
   }
 
-  get name(): string {
-    return this.#source.name;
+  override get memoryBytes(): number {
+    return super.memoryBytes + this.#bytes.length;
   }
 
-  get size(): number | null {
-    return this.#source.size;
-  }
-
-  get receivedBytes(): number {
-    return this.#source.receivedBytes;
-  }
-
-  get memoryBytes(): number {
-    return this.#source.memoryBytes + this.#bytes.length;
-  }
-
-  async read(start: number, end: number, options: ReadOptions = {}): Promise<Uint8Array> {
+  override async read(start: number, end: number, options: ReadOptions = {}): Promise<Uint8Array> {
     const { arrived = () => {}, signal, fresh = false } = options;
-    if (fresh || start >= this.#end) return this.#source.read(start, end, options);
+    if (fresh || start >= this.#end) return this.inner.read(start, end, options);
     const bytes = new Uint8Array(Math.max(0, end - start));
     const border = this.#end;
     let [known, later] = [0, 0]; // bytes of the beginning, and those behind it
@@ -47,7 +34,7 @@ export class BegunSource implements Source {
       if (known === border - start) arrived(bytes.subarray(0, known + later));
     };
     // What lies behind the beginning is requested now, so that it follows without a pause.
-    const rest = end > border ? this.#source.read(border, end, { signal, arrived: noteLater }) : null;
+    const rest = end > border ? this.inner.read(border, end, { signal, arrived: noteLater }) : null;
     rest?.catch(() => {}); // until it is awaited
     for (let isOver = false; !isOver; ) {
       if (signal?.aborted) throw new KpcError(`${this.name}: ended`, 'aborted');
@@ -65,7 +52,7 @@ export class BegunSource implements Source {
   }
 
   /** End the request of the beginning; the source itself stays open. */
-  close(): void {
+  override close(): void {
     this.#ending.abort();
   }
 
@@ -75,7 +62,7 @@ export class BegunSource implements Source {
       this.#wake();
     };
     try {
-      take(await this.#source.read(0, this.#end, { signal: this.#ending.signal, arrived: take }));
+      take(await this.inner.read(0, this.#end, { signal: this.#ending.signal, arrived: take }));
       this.#end = this.#bytes.length; // or less, at the end of the file
     } catch (error) {
       this.#error = error;

@@ -4,7 +4,7 @@ import type { Entry } from '../container/chunk.js';
 import { Container } from '../container/container.js';
 import { KpcError } from '../container/errors.js';
 import { sharedStart, withShared } from '../container/shared_planes.js';
-import { type ReadOptions, reaches, type Source } from './source.js';
+import { ForwardingSource, type ReadOptions, reaches, type Source } from './source.js';
 
 /** A read of shared planes that is under way. */
 interface Reading {
@@ -139,43 +139,23 @@ export class SharedPlanes {
 }
 
 /** A group, and the shared planes behind it. */
-class SharingSource implements Source {
-  readonly #own: Source;
+class SharingSource extends ForwardingSource {
   readonly #shared: SharedPlanes;
   readonly #start: number;
 
   /** Take a group, and the position in it at which the file of the clip begins for shared planes. */
   constructor(own: Source, shared: SharedPlanes, start: number) {
-    [this.#own, this.#shared, this.#start] = [own, shared, start];
-  }
-
-  get name(): string {
-    return this.#own.name;
-  }
-
-  get size(): number | null {
-    return this.#own.size;
-  }
-
-  get receivedBytes(): number {
-    return this.#own.receivedBytes;
-  }
-
-  get memoryBytes(): number {
-    return this.#own.memoryBytes;
+    super(own);
+    [this.#shared, this.#start] = [shared, start];
   }
 
   reaches(end: number): boolean {
-    return end > this.#start ? this.#shared.reaches(end - this.#start) : reaches(this.#own, end);
+    return end > this.#start ? this.#shared.reaches(end - this.#start) : reaches(this.inner, end);
   }
 
-  read(start: number, end: number, options?: ReadOptions): Promise<Uint8Array> {
-    if (start < this.#start) return this.#own.read(start, end, options);
+  override read(start: number, end: number, options?: ReadOptions): Promise<Uint8Array> {
+    if (start < this.#start) return this.inner.read(start, end, options);
     return this.#shared.read(start - this.#start, end - this.#start, options);
-  }
-
-  close(): void {
-    this.#own.close();
   }
 }
 

@@ -34,6 +34,35 @@ export interface Source {
 export const reaches = (source: Source, end: number): boolean =>
   source.reaches?.(end) ?? (source.size === null || end <= source.size);
 
+/** A source that hands on what it is asked to another one; others change some of that. */
+export class ForwardingSource implements Source {
+  /** Take the source that is asked, and another name for messages, if it has one. */
+  constructor(
+    protected readonly inner: Source,
+    readonly name = inner.name,
+  ) {}
+
+  get size(): number | null {
+    return this.inner.size;
+  }
+
+  get receivedBytes(): number {
+    return this.inner.receivedBytes;
+  }
+
+  get memoryBytes(): number {
+    return this.inner.memoryBytes;
+  }
+
+  read(start: number, end: number, options?: ReadOptions): Promise<Uint8Array> {
+    return this.inner.read(start, end, options);
+  }
+
+  close(): void {
+    this.inner.close();
+  }
+}
+
 /** A file that the page has: chosen by its user, or dropped. */
 export class BlobSource implements Source {
   readonly name: string;
@@ -81,35 +110,24 @@ export class BytesSource implements Source {
 }
 
 /** A file within a file: a group of a clip. */
-export class SlicedSource implements Source {
-  readonly name: string;
-  readonly #whole: Source;
+export class SlicedSource extends ForwardingSource {
   readonly #offset: number;
   readonly #length: number;
 
   constructor(whole: Source, offset: number, length: number, name: string) {
-    this.name = name;
-    this.#whole = whole;
-    this.#offset = offset;
-    this.#length = length;
+    super(whole, name);
+    [this.#offset, this.#length] = [offset, length];
   }
 
-  get size(): number {
-    const { size } = this.#whole;
+  override get size(): number {
+    const { size } = this.inner;
     return size === null ? this.#length : Math.max(0, Math.min(this.#length, size - this.#offset));
   }
 
-  get receivedBytes(): number {
-    return this.#whole.receivedBytes;
+  override read(start: number, end: number, options?: ReadOptions): Promise<Uint8Array> {
+    return this.inner.read(this.#offset + start, this.#offset + Math.min(end, this.size), options);
   }
 
-  get memoryBytes(): number {
-    return this.#whole.memoryBytes;
-  }
-
-  read(start: number, end: number, options?: ReadOptions): Promise<Uint8Array> {
-    return this.#whole.read(this.#offset + start, this.#offset + Math.min(end, this.size), options);
-  }
-
-  close(): void {}
+  /** Leave the file open for other groups. */
+  override close(): void {}
 }
