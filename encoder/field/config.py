@@ -89,6 +89,9 @@ class TrainConfig:
     rays: int = 4096
     # The most samples per step, on average. It bounds the time of a step before the occupancy grid has formed.
     samples: int = 98304
+    # Samples of less weight have their gradients computed in a share of the cases only, on a CPU (measured;
+    # `kpc.encoder.field.kernels.backward`); 0: the gradients of all are computed.
+    full_weight: float = 1 / 64
     # Share of the rays drawn from around the opaque part of pictures with alpha (measured).
     object_rays: float = 0.5
     # Share of the run after which rays are drawn by how much their pixels change over time, with cameras that stand

@@ -143,6 +143,7 @@ class FusedOptimiser:
             motion.size > 0 and number % self.config.motion_every == 0,
             self.ray_gradients,
             wants_rays,
+            np.float32(0 if wants_rays else self.config.full_weight),
         )
 
     def _step_decoder(self, basis: torch.Tensor, mask: torch.Tensor, gradients: kernels.Gradients, rate: float) -> None:

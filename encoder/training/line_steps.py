@@ -70,9 +70,10 @@ class LineSteps:
         found = np.zeros((layout.lines, M), np.float32)
         parts = np.zeros((len(blocks), int(blocks[:, 3].max()) * M), np.float32)
         kernels.line_gradients(self.field.theta.detach().numpy(), grad, blocks, M, found, parts)
-        for line, rows, columns in {(int(line), int(count), int(width)) for _, _, _, width, count, line in blocks}:
-            own = parts[blocks[:, 5] == line, : columns * M]
-            found[line + rows : line + rows + columns] = own.sum(0).reshape(columns, M)
+        lines, starts = np.unique(blocks[:, 5], return_index=True)
+        for line, first, last in zip(lines, starts, [*starts[1:], len(blocks)], strict=True):
+            columns, rows = blocks[first, 3:5]
+            found[line + rows : line + rows + columns] = parts[first:last, : columns * M].sum(0).reshape(columns, M)
         return torch.from_numpy(found)
 
     def gradient(self) -> torch.Tensor:

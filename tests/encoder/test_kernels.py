@@ -84,6 +84,23 @@ def test_the_error_of_faint_samples_without_colour_is_bounded() -> None:
         assert difference < colour, (name, difference)
 
 
+def test_drawn_samples_have_the_gradient_of_all_on_average() -> None:
+    """Compare sums over rays and over the texels of a plane; those of the density's weights cancel most."""
+    scene = translucent_scene()
+    rays, targets = random_rays(scene, 1500), torch.zeros(1500, 3)
+    every, drawn = (backpropagate(scene, rays, targets, full_weight=weight) for weight in (0.0, 0.25))
+    np.testing.assert_array_equal(drawn["errors"], every["errors"])
+    np.testing.assert_array_equal(drawn["peaks"], every["peaks"])
+    assert (drawn["basis"] != every["basis"])[every["counts"] > 2].mean() > 0.9  # some of their samples were not drawn
+    layout = Field.from_scene(scene).layout
+    starts = [start for _, _, start, _, _ in layout.planes()]
+    for g in (every, drawn):
+        g["theta"] = np.add.reduceat(g["theta"].reshape(-1, layout.channels), np.array(starts) // layout.channels)
+        g |= {name: g[name].sum(0) for name in ("basis", "rays")}
+    for name, most in {"theta": 0.03, "basis": 0.03, "rays": 0.03, "density": 0.25}.items():
+        assert np.linalg.norm(drawn[name] - every[name]) < most * np.linalg.norm(every[name]), name
+
+
 def test_the_number_of_workers_changes_only_rounding() -> None:
     scene = translucent_scene()
     rays, targets = random_rays(scene, 103), torch.zeros(103, 3)

@@ -53,6 +53,7 @@ class Gradients(NamedTuple):
     wants_motion: bool  # whether the gradient of the motion grid is computed, which takes a fifth of the time
     rays: np.ndarray  # (N, RAY_GRADIENTS) float32, of each ray; (1, RAY_GRADIENTS) where they are not wanted
     wants_rays: bool  # whether the gradients of rays are computed
+    full_weight: np.float32  # samples of less weight are drawn (`backpropagate`); 0: all are taken
 
 
 class SampleArrays(NamedTuple):

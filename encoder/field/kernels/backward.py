@@ -52,20 +52,26 @@ def end_decoder(buffers, g_density, g_basis):
 
 @inlined
 def decoder_gradient(buffers, k, g_log, g_rgb):
-    """Set buffers.g_features, and add to buffers.g_decoder, by sample k.
+    """Set buffers.g_features, and add to buffers.g_decoder, by sample k, given d loss / d C times its weight.
 
     log density = density . (features, 1);  colour_c = sigmoid(basis_c . features), 0 where the sample got none
     """
     F, one = buffers.features.shape[1], np.float32(1.0)
-    weight, red, green, blue = buffers.weights[k], buffers.decoded[k, 1], buffers.decoded[k, 2], buffers.decoded[k, 3]
+    red, green, blue = buffers.decoded[k, 1], buffers.decoded[k, 2], buffers.decoded[k, 3]
     g = (
         g_log,
-        g_rgb[0] * weight * red * (one - red),
-        g_rgb[1] * weight * green * (one - green),
-        g_rgb[2] * weight * blue * (one - blue),
+        g_rgb[0] * red * (one - red),
+        g_rgb[1] * green * (one - green),
+        g_rgb[2] * blue * (one - blue),
     )
     decode_transpose(buffers.decoder, g, F, buffers.g_features)
     add_decoder_gradient(buffers.g_decoder, g, F, buffers.features, k)
+
+
+@inlined
+def first_draw(buffers, volume):
+    """Return a number in [0, 1) that varies from ray to ray like a random one: digits of where samples begin."""
+    return buffers.s[0] / volume.step * np.float32(64.0) % np.float32(1.0)
 
 
 @bare
@@ -88,6 +94,7 @@ def backpropagate_ray(planes, volume, origin, direction, buffers, count, trans, 
     buffers.g_decoder[:] = np.float32(0.0)
     behind = g_background  # d loss / d C times the colour that comes from behind sample k
     trans_after = trans  # transmittance after sample k
+    drawn = first_draw(buffers, volume)
     for k in range(count - 1, -1, -1):
         weight, colour = buffers.weights[k], buffers.decoded[k]
         g_weight = g_rgb[0] * colour[1] + g_rgb[1] * colour[2] + g_rgb[2] * colour[3] + buffers.g_weights[k]
@@ -101,7 +108,16 @@ def backpropagate_ray(planes, volume, origin, direction, buffers, count, trans, 
         behind += weight * g_weight
         trans_after += weight
         gradients.density[-1] += g_log
-        decoder_gradient(buffers, k, g_log, g_rgb)
+        share = np.float32(1.0)
+        if weight < gradients.full_weight:
+            share = weight / gradients.full_weight
+        drawn += share
+        if drawn < np.float32(1.0):
+            continue
+        drawn -= np.float32(1.0)
+        factor = weight / share
+        g_log, g_log_tau = g_log / share, g_log_tau / share
+        decoder_gradient(buffers, k, g_log, (factor * g_rgb[0], factor * g_rgb[1], factor * g_rgb[2]))
         wants_ray = gradients.wants_rays and weight > negligible  # as for colours: others hardly move a picture
         wants_point = wants_ray or gradients.wants_motion
         scatter_planes(planes, gradients.theta, buffers.g_features, 0, buffers, k, wants_point)
@@ -133,6 +149,11 @@ def backpropagate(planes, density, volume, rays, basis, targets, distortion, gra
     D = sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 d,   with s over the extent, d = step / extent
     d D / d w_k = 2 sum_j w_j |s_k - s_j| + 2/3 w_k d
     d C / d tau_k = trans_{k+1} c_k - sum_{j>k} w_j c_j - trans_end * background,   tau = sigma * scale * step / extent
+
+    A sample with a weight w below gradients.full_weight is drawn in a share w / full_weight of the cases, and its
+    gradients are divided by that share: their mean stays the same, and most samples of a ray, on which a picture hardly
+    depends, take no time. Samples are drawn where a running sum of shares along the ray passes a whole number, so that
+    those between stand for each other.
 
     D is the distortion loss of mip-NeRF 360 (arXiv:2111.12077, eq. 15). The gradient of a ray is that of its samples'
     points and times, which stay where they are along the ray; that of its direction is without the basis.
@@ -180,6 +201,7 @@ def backpropagate(planes, density, volume, rays, basis, targets, distortion, gra
                 gradients.wants_motion,
                 gradients.rays[i if gradients.wants_rays else 0],
                 gradients.wants_rays,
+                gradients.full_weight,
             )
             backpropagate_ray(
                 planes,

@@ -29,21 +29,32 @@ def adam(theta, grad, mean, square, lr, beta1, beta2, epsilon, step_number):
     blocks = (n + (BLOCK - 1)) // BLOCK
     for block in prange(blocks):
         lo, hi = block * BLOCK, min((block + 1) * BLOCK, n)
-        p, m, v = theta[lo:hi], mean[lo:hi], square[lo:hi]
         total = grad[0, lo:hi]
         for worker in range(1, workers):
-            other = grad[worker, lo:hi]
-            for i in range(hi - lo):
-                total[i] += other[i]
-                other[i] = np.float32(0.0)
-        for i in range(hi - lo):
-            g = total[i]
-            total[i] = np.float32(0.0)
-            m_i = b1 * m[i] + (np.float32(1.0) - b1) * g
-            v_i = b2 * v[i] + (np.float32(1.0) - b2) * g * g
-            m[i] = m_i if abs(m_i) > TINY else np.float32(0.0)
-            v[i] = v_i if v_i > TINY else np.float32(0.0)
-            p[i] -= rate * (m[i] / correction1) / (math.sqrt(v[i] / correction2) + eps)
+            _move_to(total, grad[worker, lo:hi])
+        _adam_numbers(theta[lo:hi], total, mean[lo:hi], square[lo:hi], (b1, b2, correction1, correction2, rate, eps))
+
+
+@inlined
+def _move_to(total, other):
+    """Add `other` (n,) to `total`, and clear it."""
+    for i in range(total.size):
+        total[i] += other[i]
+        other[i] = np.float32(0.0)
+
+
+@inlined
+def _adam_numbers(p, g, m, v, numbers):
+    """Do the step of `adam` on some of its numbers (n,), and clear the gradient g."""
+    b1, b2, correction1, correction2, rate, eps = numbers
+    for i in range(p.size):
+        m_i = b1 * m[i] + (np.float32(1.0) - b1) * g[i]
+        v_i = b2 * v[i] + (np.float32(1.0) - b2) * g[i] * g[i]
+        g[i] = np.float32(0.0)
+        m_i = m_i if abs(m_i) > TINY else np.float32(0.0)
+        v_i = v_i if v_i > TINY else np.float32(0.0)
+        m[i], v[i] = m_i, v_i
+        p[i] -= rate * (m_i / correction1) / (math.sqrt(v_i / correction2) + eps)
 
 
 @parallel
@@ -61,31 +72,71 @@ def line_gradients(theta, grad, blocks, M, found, parts):
     for b in prange(len(blocks)):
         start, first, last, columns, line = blocks[b, 0], blocks[b, 1], blocks[b, 2], blocks[b, 3], blocks[b, 5]
         width = columns * M
-        part = parts[b]
+        part, products = parts[b], np.empty(width, np.float32)
         for row in range(first, last):
             lo = start + row * width
-            own, texels = found[line + row], theta[lo : lo + width]
+            products[:] = np.float32(0.0)
             for worker in range(workers):
-                slope = grad[worker, lo : lo + width]
-                for i in range(width):
-                    part[i] += texels[i] * slope[i]
-                for column in range(columns):
-                    for c in range(M):
-                        own[c] += texels[column * M + c] * slope[column * M + c]
+                _add_products(products, theta[lo : lo + width], grad[worker, lo : lo + width])
+            for i in range(width):
+                part[i] += products[i]
+            _add_columns(products, columns, M)
+            for c in range(M):
+                found[line + row, c] = products[c]
+
+
+@inlined
+def _add_products(total, a, b):
+    """Add a b to `total`, each (n,)."""
+    for i in range(total.size):
+        total[i] += a[i] * b[i]
+
+
+@inlined
+def _add_columns(row, columns, M):
+    """Add all columns of a row (columns M,) to its first, halves to halves: loops over M alone are too short."""
+    while columns > 1:
+        half = columns // 2
+        columns -= half
+        ahead = row[columns * M :]
+        for i in range(half * M):
+            row[i] += ahead[i]
+
+
+@inlined
+def _repeat_column(row, columns, M):
+    """Set all columns of a row (columns M,) to its first."""
+    done = 1
+    while done < columns:
+        more = min(done, columns - done)
+        ahead = row[done * M :]
+        for i in range(more * M):
+            ahead[i] = row[i]
+        done += more
 
 
 @parallel
 def scale_lines(theta, factors, blocks, M):
     """Multiply planes in theta (n,) by 1 + the factors (lines, M) of their rows, and of their columns."""
-    one = np.float32(1.0)
+    flat = factors.reshape(-1)
     for b in prange(len(blocks)):
         start, first, last, columns, line = blocks[b, 0], blocks[b, 1], blocks[b, 2], blocks[b, 3], blocks[b, 5]
+        width = columns * M
+        of_columns = flat[(line + blocks[b, 4]) * M :]
+        of_row = np.empty(width, np.float32)
         for row in range(first, last):
-            of_row = factors[line + row]
-            for column in range(columns):
-                lo, of_column = start + (row * columns + column) * M, factors[line + blocks[b, 4] + column]
-                for c in range(M):
-                    theta[lo + c] *= (one + of_row[c]) * (one + of_column[c])
+            for c in range(M):
+                of_row[c] = factors[line + row, c]
+            _repeat_column(of_row, columns, M)
+            lo = start + row * width
+            _scale_row(theta[lo : lo + width], of_row, of_columns)
+
+
+@inlined
+def _scale_row(texels, of_row, of_columns):
+    """Multiply texels (n,) by 1 + each of two factors (n,)."""
+    for i in range(texels.size):
+        texels[i] *= (np.float32(1.0) + of_row[i]) * (np.float32(1.0) + of_columns[i])
 
 
 @inlined
@@ -125,7 +176,9 @@ def add_priors(theta, grad, rows, M, space, transient, time_smoothness, sparse_t
             for centre in range(max(row - 1, 1), min(row + 2, count - 1)):
                 factor = weight * np.float32(-2.0) if centre == row else weight
                 _add_time_smoothness(theta, grad, here, start + centre * width, width, factor)
-            _add_sparse_transients(theta, grad, here, width, np.float32(sparse_transients / size))
+            _add_sparse_transients(
+                theta[here : here + width], grad[here : here + width], np.float32(sparse_transients / size)
+            )
 
 
 @inlined
@@ -135,32 +188,41 @@ def _add_variation_along(theta, grad, here, width, M, weight, steep):
     The loss is the mean over texels and channels of rho(d), d being differences between neighbours, where
     rho(d) = log(1 + steep d^2) / steep, or d^2 where `steep` is 0.
     """
-    for i in range(here + M, here + width):
-        grad[i] += weight * robust_slope(theta[i] - theta[i - M], steep)
-    for i in range(here, here + width - M):
-        grad[i] += weight * robust_slope(theta[i] - theta[i + M], steep)
+    end = here + width
+    _add_variation(grad[here + M : end], theta[here + M : end], theta[here : end - M], weight, steep)
+    _add_variation(grad[here : end - M], theta[here : end - M], theta[here + M : end], weight, steep)
 
 
 @inlined
 def _add_variation_across(theta, grad, here, beside, width, weight, steep):
     """Add the same between a row and the one that begins at `beside`."""
-    for i in range(width):
-        grad[here + i] += weight * robust_slope(theta[here + i] - theta[beside + i], steep)
+    _add_variation(grad[here : here + width], theta[here : here + width], theta[beside : beside + width], weight, steep)
+
+
+@inlined
+def _add_variation(grad, own, neighbours, weight, steep):
+    """Add the same to `grad` (n,), given texels and one neighbour of each."""
+    for i in range(grad.size):
+        grad[i] += weight * robust_slope(own[i] - neighbours[i], steep)
 
 
 @inlined
 def _add_time_smoothness(theta, grad, here, centre, width, factor):
     """Add the gradient of (P[t-1] - 2 P[t] + P[t+1])^2 (K-Planes, section 3.2), t being the row at `centre`."""
-    for i in range(width):
-        c = centre + i
-        grad[here + i] += factor * (theta[c - width] - np.float32(2.0) * theta[c] + theta[c + width])
+    before, after = theta[centre - width : centre], theta[centre + width : centre + 2 * width]
+    _add_second_difference(grad[here : here + width], before, theta[centre : centre + width], after, factor)
 
 
 @inlined
-def _add_sparse_transients(theta, grad, here, width, weight):
-    """Add the gradient of |1 - P| (K-Planes, section 3.2); it is 0 at the kink, P = 1."""
-    for i in range(here, here + width):
-        if theta[i] > np.float32(1.0):
-            grad[i] += weight
-        elif theta[i] < np.float32(1.0):
-            grad[i] -= weight
+def _add_second_difference(grad, before, own, after, factor):
+    """Add the same to `grad` (n,), given texels of three rows."""
+    for i in range(grad.size):
+        grad[i] += factor * (before[i] - np.float32(2.0) * own[i] + after[i])
+
+
+@inlined
+def _add_sparse_transients(theta, grad, weight):
+    """Add the gradient of |1 - P| (K-Planes, section 3.2) of texels (n,); it is 0 at the kink, P = 1."""
+    for i in range(grad.size):
+        above, below = theta[i] > np.float32(1.0), theta[i] < np.float32(1.0)
+        grad[i] += weight * (np.float32(above) - np.float32(below))

@@ -12,7 +12,9 @@ from kpc.format.scene.scene import Scene
 DISTORTION = 0.3
 
 
-def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int = 2) -> dict[str, np.ndarray]:
+def backpropagate(
+    scene: Scene, rays: Rays, targets: torch.Tensor, workers: int = 2, full_weight: float = 0.0
+) -> dict[str, np.ndarray]:
     """Return the gradients of the fused kernels, summed over workers, with the errors and sample counts of rays."""
     field = Field.from_scene(scene)
     layout, n = field.layout, len(targets)
@@ -32,7 +34,16 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         basis,
         targets.numpy(),
         np.float32(DISTORTION),
-        kernels.Gradients(grad, grad_density, grad_basis, grad_motion, scene.motion is not None, grad_rays, True),
+        kernels.Gradients(
+            grad,
+            grad_density,
+            grad_basis,
+            grad_motion,
+            scene.motion is not None,
+            grad_rays,
+            True,
+            np.float32(full_weight),
+        ),
         peaks,
         fused.max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
     )
