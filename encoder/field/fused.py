@@ -10,7 +10,7 @@ from torch import Tensor
 from kpc.encoder.field import kernels
 from kpc.encoder.field.field import Field, SummedField
 from kpc.encoder.field.layout import Layout
-from kpc.encoder.field.render import Rays, RayWeights, Samples, weigh_samples
+from kpc.encoder.field.render import Rays, RayWeights, Samples, shade, weigh_samples
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, SpaceMapping
 
@@ -136,6 +136,82 @@ def march_scene(field: Field, rays: Rays, scene: Scene) -> tuple[Samples, RayWei
     """Return the samples that rays take of a scene whose planes `field` holds, and their weights."""
     samples = sample_rays_fused(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
     return samples, weigh_samples(field, rays, samples, fused_features(field), scene.extent)
+
+
+def weigh_cells(field: Field, rays: Rays, scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `march_scene` finds of each sample until hardly any light passes: its ray, its cell and its weight.
+
+    Returns:
+        Numbers of rays (n,) int64, cells z, y, x (n, 3) int64, and weights (n,) float32.
+    """
+    if type(field) is not Field:
+        with torch.no_grad():
+            samples, weighed = march_scene(field, rays, scene)
+        return samples.ray.numpy(), samples.cell.numpy(), weighed.weights.numpy()
+    most = count_samples(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
+    ends = np.cumsum(most)
+    cells, weights = np.zeros((most.sum(), 3), np.int64), np.zeros(most.sum(), np.float32)
+    counts = kernels.weigh_samples(
+        planes_of(field),
+        field.density.detach().numpy(),
+        volume_of(scene.aabb, scene.occupancy, scene.step, scene.mapping),
+        ray_batch(rays),
+        ends - most,
+        cells,
+        weights,
+        max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
+        parts(),
+    )
+    reached = np.arange(len(weights)) < np.repeat(ends - most + counts, most)
+    return np.repeat(np.arange(len(most)), most)[reached], cells[reached], weights[reached]
+
+
+# Colours that are so far from targets hardly matter to the difference.
+FAR = 1e6
+
+
+def colour_gradients(
+    field: Field, rays: Rays, scene: Scene, factors: np.ndarray, codes: Tensor | None = None
+) -> list[np.ndarray]:
+    """Return the gradients of the sum of factors (N, 3) times the colours of N rays.
+
+    The kernel gives those of squared errors, 2 (C - T) d C / d theta / 3 N. With targets T = -FAR * factors, C - T is
+    FAR * factors to within 1 / FAR.
+
+    Returns:
+        The gradient of theta (n,), and that of the motion grid where there is one, float32.
+    """
+    if type(field) is not Field:
+        _, weighed = march_scene(field, rays, scene)
+        colours = shade(field, rays, weighed, codes)
+        wanted = [field.theta] if field.motion is None else [field.theta, field.motion]
+        return [each.numpy() for each in torch.autograd.grad((torch.from_numpy(factors) * colours).sum(), wanted)]
+    planes, basis = planes_of(field), field.basis(rays.directions, codes).detach().numpy()
+    workers, (N, _, F) = numba.get_num_threads(), basis.shape
+    gradients = kernels.Gradients(
+        np.zeros((workers, planes.theta.size), np.float32),
+        np.zeros((workers, F + 1), np.float32),
+        np.zeros((N, 3, F), np.float32),
+        np.zeros((workers, *planes.motion.shape), np.float32),
+        field.motion is not None,
+        np.zeros((1, kernels.RAY_GRADIENTS), np.float32),
+        False,
+        np.float32(0),
+    )
+    kernels.backpropagate(
+        planes,
+        field.density.detach().numpy(),
+        volume_of(scene.aabb, scene.occupancy, scene.step, scene.mapping),
+        ray_batch(rays),
+        basis,
+        np.float32(-FAR * factors),
+        np.float32(0),
+        gradients,
+        np.zeros((workers, *scene.occupancy.shape[1:]), np.float32),
+        max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
+    )
+    found = [gradients.theta] if field.motion is None else [gradients.theta, gradients.motion]
+    return [gradient.sum(0) * np.float32(1.5 * N / FAR) for gradient in found]
 
 
 class FusedFeatures(torch.autograd.Function):

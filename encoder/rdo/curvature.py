@@ -21,9 +21,8 @@ import torch
 
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import ValidationRays
-from kpc.encoder.field.fused import march_scene
+from kpc.encoder.field.fused import colour_gradients
 from kpc.encoder.field.layout import Layout
-from kpc.encoder.field.render import shade
 from kpc.format.common.progress import progress
 from kpc.format.scene.scene import Scene
 
@@ -73,25 +72,24 @@ def estimate_curvature(
     validation = validation.subset(rng.permutation(hits)[:rays])
     more = ValidationRays.through_occupied(scene, rays - len(validation.times), seed=2)
     parameters = [field.theta] if field.motion is None else [field.theta, field.motion]
-    squares = [torch.zeros_like(one) for one in parameters]
+    squares = [np.zeros(tuple(one.shape), np.float32) for one in parameters]
     products = [
         {name: channel_products(np.zeros_like(plane)) for name, plane in scale.items()} for scale in scene.scales
     ]
     batches = [*validation.batches(RAYS_PER_GRADIENT), *more.batches(RAYS_PER_GRADIENT)]
     for batch in progress(batches, "measuring what errors cost", unit="batches", shown=shown):
-        batch_rays = renderer.batch(*batch.rays)
-        _, composited = march_scene(field, batch_rays, scene)
         codes = renderer.codes(batch.appearances)
-        colours = shade(field, batch_rays, composited, None if codes is None else torch.from_numpy(codes))
-        signs = torch.from_numpy(rng.choice(np.array([-1, 1], np.float32), tuple(colours.shape)))
-        gradients = torch.autograd.grad((signs * colours).sum(), parameters)
-        for scale, planes in zip(products, _by_plane(field.layout, scene, gradients[0].numpy()), strict=True):
+        signs = rng.choice(np.array([-1, 1], np.float32), (len(batch.times), 3))
+        gradients = colour_gradients(
+            field, renderer.batch(*batch.rays), scene, signs, None if codes is None else torch.from_numpy(codes)
+        )
+        for scale, planes in zip(products, _by_plane(field.layout, scene, gradients[0]), strict=True):
             for name, plane in planes.items():
                 scale[name] += channel_products(plane)
         for total, gradient in zip(squares, gradients, strict=True):
-            total += gradient.square_()
+            total += np.square(gradient)
     count = max(1, len(validation.times) + len(more.times))
-    theta_diagonal, *motion = (total.numpy() / count for total in squares)
+    theta_diagonal, *motion = (total / count for total in squares)
     diagonal = [
         {name: _smooth(_smooth(plane, 0), 1) for name, plane in scale.items()}
         for scale in _by_plane(field.layout, scene, theta_diagonal)

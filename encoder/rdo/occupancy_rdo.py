@@ -14,12 +14,11 @@ it. The error is estimated on rays of the scene's cameras, from the weight that 
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from kpc.encoder.coding.occupancy_codec import CONTEXTS, NEIGHBOURS
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import Measure, ValidationRays
-from kpc.encoder.field.fused import march_scene
+from kpc.encoder.field.fused import weigh_cells
 from kpc.format.common.progress import progress
 from kpc.format.scene.grid import dilate
 from kpc.format.scene.scene import Scene
@@ -98,14 +97,13 @@ def removal_errors(scene: Scene, validation: ValidationRays, rays: int, shown: b
     sums = np.zeros(scene.occupancy.size)
     batches = [*validation.batches(RAYS_PER_BATCH), *more.batches(RAYS_PER_BATCH)]
     for batch in progress(batches, "measuring which cells matter", unit="batches", shown=shown):
-        with torch.no_grad():
-            samples, composited = march_scene(renderer.field, renderer.batch(*batch.rays), scene)
-        ray, weights = samples.ray.numpy(), composited.weights.numpy().astype(np.float64)
+        ray, cells, weights = weigh_cells(renderer.field, renderer.batch(*batch.rays), scene)
         slot = np.minimum((batch.times * slots).astype(np.int64), slots - 1)[ray]
-        cell = np.ravel_multi_index((slot, *samples.cell.numpy().T), scene.occupancy.shape)
+        cell = np.ravel_multi_index((slot, *cells.T), scene.occupancy.shape)
         # The first of a ray's consecutive samples in each cell; their weights are added up.
         first = np.flatnonzero(np.diff(cell, prepend=-1) | np.diff(ray, prepend=-1))
-        sums += np.bincount(cell[first], np.add.reduceat(weights, first) ** 2 if len(first) else None, sums.size)
+        if len(first):
+            np.add.at(sums, cell[first], np.add.reduceat(weights.astype(np.float64), first) ** 2)
     count = max(1, len(validation.times) + len(more.times))
     error: np.ndarray = 255**2 * CONTRAST * sums.reshape(scene.occupancy.shape) / count
     return error

@@ -24,19 +24,22 @@ from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import (
+    colour_gradients,
     count_samples,
     fused_features,
     log_densities,
+    march_scene,
     max_samples_per_ray,
     planes_of,
     ray_batch,
     volume_of,
+    weigh_cells,
 )
 from kpc.encoder.field.kernels import compilation
 from kpc.encoder.field.kernels.backward import LEAST_PEAK
 from kpc.encoder.field.layout import Layout
 from kpc.encoder.field.priors import plane_priors
-from kpc.encoder.field.render import Rays, render_reference
+from kpc.encoder.field.render import Rays, render_reference, shade
 from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_prior_gradients
 from kpc.format.container.scene_layout import SAMPLE_LIMIT
 from kpc.player.cpu import reference
@@ -99,6 +102,24 @@ def test_drawn_samples_have_the_gradient_of_all_on_average() -> None:
         g |= {name: g[name].sum(0) for name in ("basis", "rays")}
     for name, most in {"theta": 0.03, "basis": 0.03, "rays": 0.03, "density": 0.25}.items():
         assert np.linalg.norm(drawn[name] - every[name]) < most * np.linalg.norm(every[name]), name
+
+
+@pytest.mark.parametrize("kind", FIELD_KINDS)
+def test_colour_gradients_and_weights_equal_those_of_pytorch(kind: tuple[bool, bool, bool]) -> None:
+    scene = translucent_scene(*kind)
+    field, rays = Field.from_scene(scene), random_rays(scene, 203)
+    factors = np.random.default_rng(2).choice(np.array([-1, 1], np.float32), (203, 3))
+    samples, weighed = march_scene(field, rays, scene)
+    colours = shade(field, rays, weighed)
+    wanted = [field.theta] if field.motion is None else [field.theta, field.motion]
+    theirs = torch.autograd.grad((torch.from_numpy(factors) * colours).sum(), wanted)
+    for one, other in zip(colour_gradients(field, rays, scene, factors), theirs, strict=True):
+        np.testing.assert_allclose(one, other.numpy(), atol=GRADIENT * float(other.abs().max()))
+    ray, cells, weights = weigh_cells(field, rays, scene)
+    reached = weighed.reached.numpy()
+    np.testing.assert_array_equal(ray, samples.ray.numpy()[reached])
+    np.testing.assert_array_equal(cells, samples.cell.numpy()[reached])
+    np.testing.assert_allclose(weights, weighed.weights.detach().numpy()[reached], atol=COLOUR)
 
 
 def test_the_number_of_workers_changes_only_rounding() -> None:

@@ -288,7 +288,7 @@ def test_relative_steps_are_kept(scene_file: Path, tmp_path: Path, kpenc_says: K
 def test_a_file_that_is_not_there_is_no_folder(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         kpenc.main([str(tmp_path / name), "-o", str(tmp_path / "out.kpc")])
-    assert capsys.readouterr().err.endswith(f"{tmp_path / name}: no such file\n")
+    assert capsys.readouterr().err.endswith(f"{tmp_path / name}: no such file (see kpenc --help)\n")
 
 
 def test_damaged_files_are_refused_in_one_line(scene_file: Path, refused: Callable[..., str]) -> None:

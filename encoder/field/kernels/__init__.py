@@ -30,7 +30,7 @@ it calls: after editing a module here, delete `__pycache__`.
 
 from kpc.encoder.field.kernels.arguments import RAY_GRADIENTS, Gradients, PlaneSet, RayBatch, SampleArrays, Volume
 from kpc.encoder.field.kernels.backward import backpropagate
-from kpc.encoder.field.kernels.marching import collect_samples, render
+from kpc.encoder.field.kernels.marching import collect_samples, render, weigh_samples
 from kpc.encoder.field.kernels.points import features, log_densities, scatter_features
 from kpc.encoder.field.kernels.texels import AXES, PLACES
 from kpc.encoder.field.kernels.updates import adam, add_priors, line_gradients, scale_lines
@@ -54,4 +54,5 @@ __all__ = [
     "render",
     "scale_lines",
     "scatter_features",
+    "weigh_samples",
 ]

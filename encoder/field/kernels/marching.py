@@ -206,6 +206,39 @@ def render(planes, density, volume, rays, basis, capacity, workers):
     return rgbs, opacities, depths, counts
 
 
+@parallel
+def weigh_samples(planes, density, volume, rays, starts, cells, weights, capacity, workers):
+    """List the weights that the samples of rays have in their colours, and the occupancy cells in which they lie.
+
+    Args:
+        planes, density, volume, rays, capacity, workers: as of `render`; backgrounds are not used.
+        starts: (N,) int64, where in the lists the samples of each ray begin, which `collect_samples` counts at most.
+        cells: (n, 3) int64 to be filled, in the order z, y, x.
+        weights: (n,) float32 to be filled.
+
+    Returns:
+        (N,) int64, the samples of each ray until hardly any light passes.
+    """
+    N = rays.origins.shape[0]
+    colourless = np.zeros((3, density.size - 1), np.float32)
+    counts = np.empty(N, np.int64)
+    for worker in prange(workers):
+        buffers = new_ray_buffers(planes, capacity)
+        for i in range(worker, N, workers):
+            counts[i] = march_ray(planes, density, colourless, volume, rays, i, buffers)[0]
+            _list_cells(volume.occupancy, buffers, counts[i], cells[starts[i] :], weights[starts[i] :])
+    return counts
+
+
+@inlined
+def _list_cells(occupancy, buffers, count, cells, weights):
+    """Write cells (n, 3) and weights (n,) of the samples of a ray after `march_ray`."""
+    for k in range(count):
+        points = buffers.points[k]
+        cells[k, 0], cells[k, 1], cells[k, 2] = cell_index(occupancy[0], points[4], points[5], points[6])
+        weights[k] = buffers.weights[k]
+
+
 @inlined
 def collect_ray(volume, origin, direction, time, jitter, start, out):
     """Write the occupied samples of one ray to `out` from `start` on, as far as it reaches; return their number."""
