@@ -30,6 +30,7 @@ from kpc.player.cpu.reference import render, render_rays
 from kpc.player.sharing.file_server import Handler, Link, serving
 from kpc.player.viewpoints import presets
 from kpc.tools.bench import web_page
+from kpc.tools.cli import kpshare
 from kpc.tools.vectors.group_vectors import packed
 from sounds import decoded, sweep, write_clip_with_sound
 
@@ -56,6 +57,9 @@ class Faulty(Handler):
     def do_GET(self) -> None:
         if self.path.startswith("/page.html?"):
             self.answer_with(unquote(self.path.partition("?")[2]).encode(), "Content-Type", "text/html")
+            return
+        if self.path.startswith("/gallery/"):
+            super().do_GET()
             return
         self.fault, _, rest = self.path.lstrip("/").rpartition("/")
         self.path, self.is_shared = f"/{rest}", self.fault != "refused"
@@ -120,6 +124,13 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     for name, whole, count in ("stub", "scene", 10_000), ("cut", "scene", 30_000), ("cut-clip", "long", 70_000):
         (folder / f"{name}.kpc").write_bytes((folder / f"{whole}.kpc").read_bytes()[:count])
     Image.new("RGB", (64, 48), (40, 90, 140)).save(folder / "poster.png")
+    scenes = tmp_path_factory.mktemp("scenes")
+    for name in "one.kpc", "two 2.kpc":
+        (scenes / name).write_bytes(data)
+    with pytest.MonkeyPatch.context() as patch:
+        for side in "SIDE", "SLOW_SIDE":
+            patch.setattr(f"kpc.tools.rendering.poster.{side}", 16)
+        assert kpshare.main(["--gallery", str(scenes), "-o", str(folder / "gallery")]) == 0
     with serving(folder, handler=Faulty) as url:
         yield url
 

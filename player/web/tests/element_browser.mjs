@@ -21,6 +21,11 @@ const scenarios = new Map();
 const scenario = (name, run) => scenarios.set(name, run);
 const browser = await chromium.launch({ executablePath, args: FLAGS });
 
+function noteErrors(page) {
+  page.errors = [];
+  page.on('pageerror', (error) => page.errors.push(error.message));
+}
+
 /**
  * Open a page with players, at little cost.
  * @param body HTML, in which `kpc-player` gets a size and a level unless `isPlain`.
@@ -30,8 +35,7 @@ async function open(body, { hash = '', context = {}, isPlain = false, csp = '', 
   const browserContext = await browser.newContext({ viewport, ...context });
   await browserContext.grantPermissions(['clipboard-read', 'clipboard-write']);
   const page = await browserContext.newPage();
-  page.errors = [];
-  page.on('pageerror', (error) => page.errors.push(error.message));
+  noteErrors(page);
   const style = isPlain ? '' : '<style>kpc-player { width: 240px; height: 180px }</style>';
   const policy = csp && `<meta http-equiv="Content-Security-Policy" content="${csp}">`;
   const html = `<!doctype html><html lang="en"><meta charset="utf-8"><title>Test</title>${policy}
@@ -543,6 +547,21 @@ scenario('plays what is there of a file that is cut off, and says so', async () 
     assert.equal(await inside(page, '.notice').isVisible(), true);
     await close(page);
   }
+});
+
+scenario('is opened by a gallery in a folder of its host', async () => {
+  const page = await browser.newPage({ viewport: { width: 800, height: 500 } });
+  noteErrors(page);
+  page.on('response', (response) => response.ok() || page.errors.push(`${response.url()}: ${response.status()}`));
+  await page.goto(`${address}/gallery/index.html`);
+  await page.waitForFunction(() => [...document.images].every(({ naturalWidth }) => naturalWidth === 16));
+  assert.equal(await page.locator('img').count(), 2);
+  await page.screenshot({ path: join(folder, 'gallery.png') });
+  await page.locator('a[href^="two"]').click();
+  await shown(page);
+  assert.match(await player(page, (it) => it.src), /\/gallery\/two[^/]*\/two[^/]*\.kpc$/);
+  assert.equal(await player(page, (it) => it.error), null);
+  await close(page);
 });
 
 scenario('says that there is no WebGL2', async () => {
