@@ -12,6 +12,9 @@ from kpc.format.scene.grid import SPACE_TIME_AXES, dilate
 # Share of cells by which merging time slots may raise the mean occupancy.
 MERGE_TOLERANCE = 0.1
 
+# What `OccupancyGrid.marched` holds of cells in which rays take every STRIDE-th sample only, for as many steps.
+THINLY, STRIDE = 2, 4
+
 # A function of (N, 3) float32 points in [0, 1]^3 and (N,) float32 times that returns (N,) log densities.
 DensityAt = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -51,6 +54,8 @@ class OccupancyGrid:
         kept: (Nz, Ny, Nx) bool, cells that are occupied in any case; None for none.
         active: (slots, Nz, Ny, Nx) bool, the occupied cells where rays take samples in each time slot; one slot until
             `split`.
+        marched: (slots, Nz, Ny, Nx) uint8, `active` as rays of training take it: THINLY where nothing but `kept` says
+            that a cell is occupied.
     """
 
     # Subtracted from the log density at each update.
@@ -72,16 +77,16 @@ class OccupancyGrid:
         self.threshold = threshold
         self.log_density = np.full(visible.shape, -np.inf, np.float32)
         self.peak = np.ones(visible.shape, np.float32)
-        self.occupied = visible.copy()
+        self._found = visible.copy()  # what is occupied without `kept`
         self.kept: np.ndarray | None = None
-        self.active = self.occupied[None]
         self._dense = np.ones((1, *visible.shape), bool)
         self._is_sampled = False
+        self._activate()
 
     def restrict(self, cells: np.ndarray) -> None:
         """Let no cells be occupied but these, (Nz, Ny, Nx) bool."""
         self.visible = self.visible & cells
-        self.occupied &= cells
+        self._found &= cells
         if self.kept is not None:
             self.kept = self.kept & cells
         self._activate()
@@ -107,7 +112,7 @@ class OccupancyGrid:
             self.log_density[chosen] = np.maximum(
                 self.log_density[chosen], self._sample(density_at, cells, rng, 0.0, 1.0)
             )
-        self.occupied = matters & (self.log_density > self._density_threshold())
+        self._found = matters & (self.log_density > self._density_threshold())
         self._activate()
 
     def split(self, density_at: DensityAt, slots: int, rng: np.random.Generator) -> None:
@@ -121,16 +126,18 @@ class OccupancyGrid:
 
     def _activate(self) -> None:
         """Set `active` to the cells that are occupied and hold density, and `kept`."""
+        self.occupied, self.active = self._found, self._found & self._dense
+        self.marched = self.active.astype(np.uint8)
         if self.kept is not None:
-            self.occupied |= self.kept
-        self.active = self.occupied & (self._dense if self.kept is None else self._dense | self.kept)
+            self.marched[~self.active & self.kept] = THINLY
+            self.occupied, self.active = self._found | self.kept, self.active | self.kept
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint holds of this grid."""
         return {
             "log_density": torch.from_numpy(self.log_density),
             "peak": torch.from_numpy(self.peak),
-            "occupied": torch.from_numpy(self.occupied),
+            "occupied": torch.from_numpy(self._found),
             "dense": torch.from_numpy(self._dense),
             "known": self._is_sampled,
         }
@@ -138,7 +145,7 @@ class OccupancyGrid:
     def load(self, state: dict[str, Any]) -> None:
         """Take over what `state` returned."""
         names = ("log_density", "peak", "occupied", "dense")
-        self.log_density, self.peak, self.occupied, self._dense = (state[name].cpu().numpy() for name in names)
+        self.log_density, self.peak, self._found, self._dense = (state[name].cpu().numpy() for name in names)
         self._activate()
         self._is_sampled = bool(state["known"])
 

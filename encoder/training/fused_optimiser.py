@@ -77,7 +77,7 @@ class FusedOptimiser:
         Args:
             number: of the step, from 0. fraction: of the run, in [0, 1]. rate: factor on the learning rates.
             batch: N rays. targets: (N, 3) colours in [0, 1].
-            aabb: (2, 3) float32. occupancy: (slots, Nz, Ny, Nx) bool. step_length: in s. extent: longest edge of aabb.
+            aabb: (2, 3) float32. occupancy: `OccupancyGrid.marched`. step_length: in s. extent: longest edge of aabb.
 
         Returns:
             The mean squared error per colour channel, and the mean number of samples per ray.

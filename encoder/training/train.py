@@ -212,7 +212,7 @@ class Trainer:
             batch,
             targets,
             self.aabb,
-            self.grid.active,
+            self.grid.marched,
             self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1),
             self.extent,
         )

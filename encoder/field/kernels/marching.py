@@ -16,6 +16,7 @@ from kpc.encoder.field.kernels.geometry import (
 from kpc.encoder.field.kernels.planes import place_sample, sample_displaced
 from kpc.encoder.field.kernels.texels import POINT
 from kpc.encoder.field.kernels.vectors import WIDE, absorb, decode, dot, sigmoids
+from kpc.encoder.field.occupancy_grid import STRIDE, THINLY
 from kpc.format.container.scene_layout import SAMPLE_LIMIT
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION
 
@@ -80,12 +81,13 @@ def set_decoder(buffers, density, basis):
 def find_samples(volume, occupied, span, origin, direction, time, jitter, buffers, first, k):
     """Write the next occupied samples of a ray, BLOCK at most, to the buffers from `first` on.
 
-    buffers.taus is set to the thickness per density. `span` is from `ray_span`, `k` the step to begin with.
+    buffers.taus is set to the thickness per density. Where rays march THINLY, every STRIDE-th step stands for as many,
+    counted from one that varies from ray to ray. `span` is from `ray_span`, `k` the step to begin with.
 
     Returns:
         The number of samples, and the step to go on with.
     """
-    (near, far), inverse = span, inverse_edges(volume.aabb)
+    (near, far), inverse, phase = span, inverse_edges(volume.aabb), int(jitter * np.float32(4096.0))
     count, room = 0, min(BLOCK, buffers.weights.size - BLOCK - first)
     while count < room and k < MOST_STEPS:
         s = near + (np.float32(k) + jitter) * volume.step
@@ -94,12 +96,17 @@ def find_samples(volume, occupied, span, origin, direction, time, jitter, buffer
             break
         t = ray_distance(s, volume.uniform_distance)
         u, v, w, radius = ray_point(origin, direction, t, volume.aabb, inverse, volume.uniform_distance)
-        if occupied[cell_index(occupied, u, v, w)] == 0:
+        cell, length = occupied[cell_index(occupied, u, v, w)], volume.step
+        if cell == 0:
             continue
+        if cell == THINLY:
+            if (k + phase) % STRIDE != 0:
+                continue
+            length *= np.float32(STRIDE)
         place_sample(buffers, first + count, u, v, w, time)
         buffers.s[first + count] = s
         scale = density_scale(t, radius, volume.uniform_distance)
-        buffers.taus[first + count] = volume.step * scale / volume.extent
+        buffers.taus[first + count] = length * scale / volume.extent
         count += 1
     return count, k
 
