@@ -183,6 +183,18 @@ def test_errors_of_options_are_one_line(module: str, capsys: pytest.CaptureFixtu
     assert capsys.readouterr().err == f"{name}: error: unrecognized arguments: --c\\nd (see {name} --help)\n"
 
 
+def test_files_may_stand_on_both_sides_of_an_option(capsys: pytest.CaptureFixture[str]) -> None:
+    parser = cli.Parser("kpx")
+    parser.add_argument("files", nargs="+")
+    parser.add_argument("-o", required=True)
+    given = parser.parse_args(["a", "-o", "b", "c"])
+    assert (given.files, given.o) == (["a", "c"], "b")
+    for words in (["-o", "b"], ["a"]):
+        with pytest.raises(SystemExit, match="2"):
+            parser.parse_args(words)
+        assert "kpx: error: the following arguments are required: " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "module",
     [

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from kpc import commands
+from kpc.format.common import cli
 from kpc.format.common.text import byte_text
 from kpc.tools.bench import kpbench
 from kpc.tools.cli import kpedit
@@ -35,7 +36,7 @@ def test_no_message_names_a_function(module: str, monkeypatch: pytest.MonkeyPatc
     def stop(self: argparse.ArgumentParser, *_: object) -> None:
         raise Found(self)
 
-    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", stop)
+    monkeypatch.setattr(cli.Parser, "parse_args", stop)
     refused = 0
     for words in PARTS if module == kpbench.__name__ else [[]]:
         with pytest.raises(Found) as found:

@@ -96,6 +96,13 @@ class Parser(argparse.ArgumentParser):
 
     _words: Sequence[str] = ()
 
+    def parse_args(  # type: ignore[override]  # overloads of one meaning
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> Any:
+        """Parse words as argparse does; files may stand before and after options, but where there are subcommands."""
+        parse = super().parse_args if self._subparsers is not None else self.parse_intermixed_args
+        return parse(args, namespace)
+
     def parse_known_args(  # type: ignore[override]  # overloads of one meaning
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> tuple[Any, list[str]]:

@@ -29,7 +29,7 @@ from kpc.format.scene.rig import Rig
 from kpc.player.app import preferences
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.controls import Playback
-from kpc.player.app.playlist import Playlist
+from kpc.player.app.playlist import Playlist, menu_names
 from kpc.player.app.preferences import MIN_WINDOW, TARGET_FPS, WINDOW_SIDES, Preferences
 from kpc.player.app.resolution_controller import GPU_FPS
 from kpc.player.quality import LEVELS
@@ -183,9 +183,9 @@ def _play(
     before: Playback | None = None
     try:
         while True:
-            window.set_title(_title(stream))
             name, is_remote = stream.source.name, isinstance(stream.source, RemoteSource)
             playlist.opened(file, name if is_remote else os.path.abspath(name))
+            window.set_title(_title(stream.metadata.title, playlist))
             player = Player(
                 window, stream, settings, resume_from=interrupted, folder=Path(options.folder or "."), playlist=playlist
             )
@@ -229,9 +229,9 @@ def _play(
         window.close()
 
 
-def _title(stream: "GroupPlayback") -> str:
+def _title(title: str, playlist: Playlist) -> str:
     """Return the title of the window: that of the scene, which several may have, and the name of its file."""
-    file, title = Path(stream.source.name).name, stream.metadata.title
+    file = menu_names(playlist.files)[playlist.position]
     return f"{title} ({file}) - kpplay" if title else f"{file} - kpplay"
 
 

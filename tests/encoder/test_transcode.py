@@ -308,6 +308,12 @@ def test_options_of_training_are_refused(scene_file: Path, tmp_path: Path, capsy
         assert f"{words[0]}: {scene_file} is trained already" in capsys.readouterr().err
 
 
+def test_a_video_alone_is_not_taken_for_a_trained_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "cam00.mp4").write_bytes(b"film")
+    assert kpenc.main([str(tmp_path / "cam00.mp4"), "-o", str(tmp_path / "x.kpc"), "--preset", "fast"]) == 2
+    assert "cam00.mp4: neither a folder of videos or images, nor" in capsys.readouterr().err
+
+
 def test_a_source_is_never_overwritten(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = scene_file.read_bytes()
     assert kpenc.main([str(scene_file), "-o", str(scene_file), "--quality", "10"]) == 2

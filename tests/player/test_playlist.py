@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 
 from kpc.format.common.errors import UsageError
+from kpc.player.app import kpplay
 from kpc.player.app.playlist import MAX_RECENT, NAME_CHARACTERS, Playlist, menu_names
 
 
@@ -37,3 +38,11 @@ def test_a_menu_tells_files_apart() -> None:
     assert names[:4] == ["one/scene.kpc", "two/scene.kpc", "other.kpc", "other.kpc"]
     assert names[4].endswith("01.kpc") and names[5].endswith("02.kpc") and names[6] == "x.kpc"
     assert max(map(len, names)) == NAME_CHARACTERS
+
+
+def test_the_window_is_named_by_title_and_file() -> None:
+    playlist = Playlist(["a.kpc", "takes/a.kpc", "b.kpc"])
+    playlist.step(1)
+    assert kpplay._title("Vase", playlist) == "Vase (takes/a.kpc) - kpplay"
+    playlist.step(1)
+    assert kpplay._title("", playlist) == "b.kpc - kpplay"
