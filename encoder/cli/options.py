@@ -18,6 +18,7 @@ from kpc.encoder.poses.wishes import Wishes, add_pose_options, wishes_from
 from kpc.encoder.rdo.codec_model import is_coded
 from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, Trade
 from kpc.format.common import cli
+from kpc.format.common.errors import UsageError
 from kpc.format.container.metadata_options import TEXTS, add_metadata_options, members_from
 
 # `Options.test_views` for all held-out pictures.
@@ -392,9 +393,12 @@ def _check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     if given.source.is_fifo():
         parser.error(f"{given.source}: is a pipe, and sources are read in any order; save it to a file")
     if given.source.is_file():
-        is_coded(given.source)  # raises if it is neither a .kpc file nor a checkpoint
         for name, value in vars(given).items():
             if name not in TRANSCODE_OPTIONS and value != parser.get_default(name):
+                try:
+                    is_coded(given.source)
+                except UsageError as error:  # it is neither a .kpc file nor a checkpoint
+                    parser.error(str(error))
                 parser.error(
                     f"--{name.replace('_', '-')}: {given.source} is trained already and can only be coded anew; drop it"
                 )
