@@ -13,7 +13,7 @@ from kpc.format.scene.grid import SPACE_TIME_AXES, dilate
 MERGE_TOLERANCE = 0.1
 
 # What `OccupancyGrid.marched` holds of cells in which rays take every STRIDE-th sample only, for as many steps.
-THINLY, STRIDE = 2, 4
+STRIDED, STRIDE = 2, 4
 
 # A function of (N, 3) float32 points in [0, 1]^3 and (N,) float32 times that returns (N,) log densities.
 DensityAt = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -54,7 +54,7 @@ class OccupancyGrid:
         kept: (Nz, Ny, Nx) bool, cells that are occupied in any case; None for none.
         active: (slots, Nz, Ny, Nx) bool, the occupied cells where rays take samples in each time slot; one slot until
             `split`.
-        marched: (slots, Nz, Ny, Nx) uint8, `active` as rays of training take it: THINLY where nothing but `kept` says
+        marched: (slots, Nz, Ny, Nx) uint8, `active` as rays of training take it: STRIDED where nothing but `kept` says
             that a cell is occupied.
     """
 
@@ -129,7 +129,7 @@ class OccupancyGrid:
         self.occupied, self.active = self._found, self._found & self._dense
         self.marched = self.active.astype(np.uint8)
         if self.kept is not None:
-            self.marched[~self.active & self.kept] = THINLY
+            self.marched[~self.active & self.kept] = STRIDED
             self.occupied, self.active = self._found | self.kept, self.active | self.kept
 
     def state(self) -> dict[str, Any]:

@@ -38,7 +38,7 @@ from kpc.encoder.field.fused import (
 from kpc.encoder.field.kernels import compilation
 from kpc.encoder.field.kernels.backward import LEAST_PEAK
 from kpc.encoder.field.layout import Layout
-from kpc.encoder.field.occupancy_grid import STRIDE, THINLY
+from kpc.encoder.field.occupancy_grid import STRIDE, STRIDED
 from kpc.encoder.field.priors import plane_priors
 from kpc.encoder.field.render import Rays, render_reference, shade
 from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_prior_gradients
@@ -123,15 +123,15 @@ def test_colour_gradients_and_weights_equal_those_of_pytorch(kind: tuple[bool, b
     np.testing.assert_allclose(weights, weighed.weights.detach().numpy()[reached], atol=COLOUR)
 
 
-def test_thin_samples_absorb_as_much_on_average() -> None:
+def test_samples_with_a_stride_absorb_as_much_on_average() -> None:
     """Rays take every STRIDE-th step through a box that is thin enough for its absorption to be all but linear."""
     scene = translucent_scene()
     scene = replace(scene, decoder=replace(scene.decoder, density_bias=-4.0), occupancy=np.ones((1, 4, 4, 4), np.uint8))
     field, rays = Field.from_scene(scene), random_rays(scene, 1500)
     whole = weigh_cells(field, rays, scene)
-    thin = weigh_cells(field, rays, replace(scene, occupancy=np.full((1, 4, 4, 4), THINLY, np.uint8)))
-    assert len(thin[0]) == pytest.approx(len(whole[0]) / STRIDE, rel=0.02)
-    assert thin[2].sum() == pytest.approx(whole[2].sum(), rel=0.02)
+    strided = weigh_cells(field, rays, replace(scene, occupancy=np.full((1, 4, 4, 4), STRIDED, np.uint8)))
+    assert len(strided[0]) == pytest.approx(len(whole[0]) / STRIDE, rel=0.02)
+    assert strided[2].sum() == pytest.approx(whole[2].sum(), rel=0.02)
 
 
 def test_the_number_of_workers_changes_only_rounding() -> None:

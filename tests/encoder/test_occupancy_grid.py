@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kpc.encoder.field.occupancy_grid import MERGE_TOLERANCE, THINLY, OccupancyGrid, grid_shape, merge_slots
+from kpc.encoder.field.occupancy_grid import MERGE_TOLERANCE, STRIDED, OccupancyGrid, grid_shape, merge_slots
 from kpc.format.scene.grid import SPACE_TIME_AXES, dilate
 
 SHAPE = (6, 5, 8)
@@ -188,14 +188,14 @@ def test_slots_are_merged_as_far_as_motion_allows() -> None:
         assert (whole | before == whole).all() and (after.any(0) == before.any(0)).all()
 
 
-def test_kept_cells_are_marched_thinly_where_nothing_else_occupies_them() -> None:
+def test_kept_cells_that_nothing_else_occupies_are_marched_with_a_stride() -> None:
     g = grid()
     g.kept = np.zeros(SHAPE, bool)
     g.kept[:, :, :4] = True
     settled(g, ball, np.ones(SHAPE, np.float32))
     found = g.marched[0] == 1
     assert found[3, 2, 3] and found[3, 2, 4] and not found[0, 0, 0]  # the ball's middle, and a corner
-    np.testing.assert_array_equal(g.marched[0] == THINLY, g.kept & ~found)
+    np.testing.assert_array_equal(g.marched[0] == STRIDED, g.kept & ~found)
     np.testing.assert_array_equal(g.occupied, g.kept | found)
     np.testing.assert_array_equal(g.active[0], g.occupied)
     again = grid()

@@ -28,7 +28,7 @@ class Volume(NamedTuple):
 
     aabb: np.ndarray  # (2, 3) float32, lower and upper corner
     uniform_distance: np.float32  # of `kpc.format.scene.space.Contraction`; 0 where the scene ends at its box
-    occupancy: np.ndarray  # (slots, Nz, Ny, Nx) uint8; 0, 1, or THINLY of `kpc.encoder.field.occupancy_grid`
+    occupancy: np.ndarray  # (slots, Nz, Ny, Nx) uint8; 0, 1, or STRIDED of `kpc.encoder.field.occupancy_grid`
     step: np.float32  # length of a step, in s
     extent: np.float32  # longest edge of the box: densities are per this length
 

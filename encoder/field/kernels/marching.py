@@ -16,7 +16,7 @@ from kpc.encoder.field.kernels.geometry import (
 from kpc.encoder.field.kernels.planes import place_sample, sample_displaced
 from kpc.encoder.field.kernels.texels import POINT
 from kpc.encoder.field.kernels.vectors import WIDE, absorb, decode, dot, sigmoids
-from kpc.encoder.field.occupancy_grid import STRIDE, THINLY
+from kpc.encoder.field.occupancy_grid import STRIDE, STRIDED
 from kpc.format.container.scene_layout import SAMPLE_LIMIT
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION
 
@@ -81,7 +81,7 @@ def set_decoder(buffers, density, basis):
 def find_samples(volume, occupied, span, origin, direction, time, jitter, buffers, first, k):
     """Write the next occupied samples of a ray, BLOCK at most, to the buffers from `first` on.
 
-    buffers.taus is set to the thickness per density. Where rays march THINLY, every STRIDE-th step stands for as many,
+    buffers.taus is set to the thickness per density. In a STRIDED cell every STRIDE-th step stands for as many,
     counted from one that varies from ray to ray. `span` is from `ray_span`, `k` the step to begin with.
 
     Returns:
@@ -99,7 +99,7 @@ def find_samples(volume, occupied, span, origin, direction, time, jitter, buffer
         cell, length = occupied[cell_index(occupied, u, v, w)], volume.step
         if cell == 0:
             continue
-        if cell == THINLY:
+        if cell == STRIDED:
             if (k + phase) % STRIDE != 0:
                 continue
             length *= np.float32(STRIDE)
