@@ -142,7 +142,7 @@ def test_gradients_equal_those_of_autograd_in_double_precision(kind: str) -> Non
     scene = with_appearances(with_hybrid_decoder(translucent_scene()) if kind == "hybrid" else translucent_scene())
     rays = replace(random_rays(scene, 160), appearances=torch.from_numpy(np.random.default_rng(3).integers(0, 3, 160)))
     targets = torch.from_numpy(np.random.default_rng(1).random((160, 3), np.float32))
-    config = replace(CONFIG, appearance="image", appearance_decay=0.05, regularise_every=1000)
+    config = replace(CONFIG, appearance="image", appearance_decay=0.05, regularise_every=1000, full_weight=0.0)
     field = Field.from_scene(scene)
     optimiser = (FusedOptimiser if kind == "fused" else TorchOptimiser)(field, config, scene.occupancy.shape[1:])
     twin = copy.deepcopy(field).double()

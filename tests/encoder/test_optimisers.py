@@ -122,6 +122,7 @@ def test_both_optimisers_take_the_same_steps(
         motion_cells=motion_cells,
         appearance=appearance,
         coarse_until=coarse_until,
+        full_weight=0.0,
     )
     plain = torch_twin(run)
     for number in range(3):

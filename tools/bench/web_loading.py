@@ -26,7 +26,6 @@ from kpc.player.viewpoints import fit_camera
 from kpc.tools.bench import web_page
 from kpc.tools.bench.records import Record
 from kpc.tools.exchange.points import surface_points
-from kpc.tools.vectors.group_vectors import packed
 
 SIZE = (320, 240)
 PLAY_S, TIMEOUT_S = 5, 600
@@ -79,6 +78,8 @@ def sought_in(data: bytes, frame_count: int) -> bytes:
 
     Clips that are joined store planes only once that are alike; those of its end would arrive with its beginning.
     """
+    from kpc.tools.vectors.group_vectors import packed  # needs zstandard, which viewers do without
+
     copies = max(REPEATS, -(-SOUGHT_BYTES // len(data)))
     return packed([(frame_count * number, frame_count, data) for number in range(copies)])
 
