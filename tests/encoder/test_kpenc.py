@@ -786,7 +786,6 @@ def test_rate_distortion_targets(run: Kpenc, sets: Path, tmp_path: Path) -> None
     "words, named",
     [
         (("--max-loss", "much"), "0.1dB"),
-        (("--max-loss", "-1dB"), "--max-loss=-1dB"),
         (("--max-loss=-1dB",), "0.1dB"),
         (("--target-size", "nanMB"), "2MB"),
         (("--target-size", "K"), "2MB"),
