@@ -30,7 +30,7 @@ from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 # Figures behind these constants: docs/design/rate-distortion.md, "Sequential fine-tuning".
 RAYS = 1 << 12  # rays per step
 SHARE = 0.2  # of the steps of training that one fine-tuning takes at most, so that short runs are not tuned for longer
-LEARNING_RATE, DECODER_LEARNING_RATE = 2e-3, 5e-4  # initial; both fall linearly to 0
+LEARNING_RATE, DECODER_LEARNING_RATE = 7e-4, 2e-4  # initial; both fall linearly to 0
 SPREAD = 0.2  # octaves by which the steps of the first planes are coarser, and those of the last finer
 
 # Codes some planes of a scene and returns them as decoded.
@@ -207,6 +207,7 @@ def _field_and_optimiser(scene: Scene, steps: int) -> tuple[Field, FusedOptimise
         appearance_learning_rate=0.0,
         view_dependent=not explicit or bool(scene.decoder.w2.any()),
         distortion=0.0,
+        full_weight=0.0,
         channel_dropout=0.0,
         scale_dropout=0.0,
         coarse_until=0.0,
