@@ -1,4 +1,7 @@
-"""Adam, factors of rows and columns, and the gradients of the priors on planes."""
+"""Adam, factors of rows and columns, and the gradients of the priors on planes.
+
+Inner loops are functions of slices: within a `prange`, LLVM makes no vectors of them (docs/design/training.md).
+"""
 
 import math
 
