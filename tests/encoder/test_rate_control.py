@@ -347,6 +347,26 @@ def test_harmful_fine_tuning_is_not_used() -> None:
     assert tuned_to(1e-3, lam=0.3).cost(0.3) <= coded(lam=0.3).cost(0.3)
 
 
+def test_nothing_is_searched_for_that_fine_tuning_beats_already() -> None:
+    """Fine-tuned codings end below the limit whatever their steps, and are small: no search without follows."""
+    made: list[str] = []
+
+    def judge(scene: Scene) -> Fidelity:
+        return Fidelity(30 - 0.11, 1.0) if scene.step == 7 else measure(scene)
+
+    def quantise(*arguments: object) -> QuantisedScene:
+        made.append("plain")
+        return quantise_by_cost(*arguments)  # type: ignore[arg-type]
+
+    def tune(steps: Steps, reached: np.ndarray) -> QuantisedScene:
+        made.append("tuned")
+        return replace(coarse.quantised, step=7.0)
+
+    coarse = coded(max_loss_db=1.1)
+    found = controller(SCENE, EQUAL, ALIKE, judge, 30.0, quantise=quantise, tune=tune).meet(Trade(0.15))
+    assert found.quantised.step == 7 and "plain" not in made[made.index("tuned") :]
+
+
 def test_failed_fine_tuning_leaves_the_untuned_coding() -> None:
     def broken(scene: Scene) -> Fidelity:
         return Fidelity(math.nan, math.nan) if scene.step == 7 else measure(scene)
