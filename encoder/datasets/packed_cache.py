@@ -43,6 +43,7 @@ from kpc.encoder.datasets.pixel_cache import (
 )
 from kpc.format.common.cli import NO_ROOM, atomic_write
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import byte_text
 
 # Pictures that share a background: as many as take so much memory while it is found, within these limits.
 GROUP_BYTES = 192 << 20
@@ -215,7 +216,7 @@ class PackedCache(PixelCache):
 
     def describe(self) -> str:
         raw = int(self._offset[-1] + self.tiles[-1].width * self.tiles[-1].height) * self._stored
-        return f"{raw / 1e9:.3g} GB, compressed to {self.disk_bytes / 1e9:.3g} GB, in {self.path}"
+        return f"{byte_text(raw)}, compressed to {byte_text(self.disk_bytes)}, in {self.path}"
 
     def _read_many(self, part: np.ndarray, starts: np.ndarray, sizes: np.ndarray | int) -> list[bytes]:
         """Read runs of bytes from the files of the given parts, (N,) each."""

@@ -166,7 +166,7 @@ class FlatCache(PixelCache):
         return self._file.size
 
     def describe(self) -> str:
-        return f"{self.disk_bytes / 1e9:.3g} GB, not compressed, in {self.path}"
+        return f"{byte_text(self.disk_bytes)}, not compressed, in {self.path}"
 
     def is_intact(self) -> bool:
         """Return whether the file has the right length and the verified pictures match their CRCs."""

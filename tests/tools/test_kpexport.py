@@ -126,6 +126,15 @@ def test_two_runs_do_not_mix_their_files_in_a_folder(run: Run, ball_file: Path, 
     assert not list(tmp_path.iterdir())
 
 
+def test_locks_of_interrupted_runs_are_removed_and_those_at_work_kept(tmp_path: Path) -> None:
+    with claimed(tmp_path, "kpexport", {"input": "a.kpc"}):
+        (own,) = tmp_path.iterdir()
+        own.with_name(own.name.replace(".lock", "-killed.lock")).touch()
+        with claimed(tmp_path, "kpexport", {"input": "a.kpc"}):
+            assert own in tmp_path.iterdir() and len(list(tmp_path.iterdir())) == 2
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_mesh_is_closed_and_faces_outwards(run: Run, ball_file: Path, tmp_path: Path) -> None:
     pytest.importorskip("skimage", reason="scikit-image is not installed, which makes meshes")
     out = tmp_path / "mesh.glb"

@@ -303,7 +303,8 @@ def test_resuming_tells_black_from_transparent(run: Run, scene_file: Path, tmp_p
 def test_pictures_of_other_options_are_never_taken_for_finished(run: Run, scene_file: Path, tmp_path: Path) -> None:
     words = [scene_file, *SIZE, "-o", tmp_path / "out"]
     assert run(*words, "--frames", "0-1", "--background", "white")[0] == 0
-    assert run(*words, "--frames", "1-1", "--background", "black")[0] == 0
+    code, _, said = run(*words, "--frames", "1-1", "--background", "black")
+    assert code == 0 and "other pictures stay there, such as 0000.png; 1 in all" in said
     code, _, printed = run(*words, "--frames", "0-1", "--background", "black", "--resume")
     assert code == 2 and "another value of --background (various, now" in printed
     assert run(*words, "--frames", "0-1", "--background", "black")[0] == 0

@@ -86,6 +86,7 @@ def _write(options: argparse.Namespace, groups: Groups, edits: Edits) -> tuple[i
         return edit(options.scene, options.output, edits, metadata)
     if metadata.document == groups.metadata().document:
         notice("kpedit: there is nothing to change; the output is a copy of the source")
+        return save(options.scene.read_bytes(), options.output), None
     return save(with_metadata(options.scene, metadata), options.output), None
 
 

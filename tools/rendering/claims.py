@@ -45,12 +45,14 @@ def claimed(folder: Path, command: str, described: Mapping[str, Any]) -> Iterato
         return
     try:
         for path in folder.glob(f".{command}-*.lock"):
-            if path == mine or path.name.startswith(f".{command}-{kind}-"):
+            if path == mine:
                 continue
             other = FileLock(path)
             try:
                 other.acquire(timeout=0)
             except Timeout:
+                if path.name.startswith(f".{command}-{kind}-"):
+                    continue
                 raise UsageError(
                     f"{folder}: another {command} with other options is at work there; wait for it, or give another "
                     "folder with -o"

@@ -13,6 +13,7 @@ import numpy as np
 
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import UsageError
+from kpc.format.common.text import notice
 from kpc.format.container.http_address import Address, is_url
 from kpc.tools.rendering.claims import claimed
 
@@ -36,7 +37,7 @@ def rendering(
 
     Without `--resume`, pictures of other options that are to be replaced are deleted first, so that a later `--resume`
     does not take them for finished, and so are those that lay there before the first run; where others stay, the folder
-    is noted to hold pictures of various options, or of unknown origin.
+    is noted, and said, to hold pictures of various options, or of unknown origin.
 
     Args:
         folder: the folder of the pictures.
@@ -91,10 +92,13 @@ def _begin(folder: Path, options: argparse.Namespace, now: dict[str, Any], paths
         changed, stale, unknown = [], names, _pictures(folder)
     for name in stale:
         (folder / name).unlink(missing_ok=True)
-    if changed and _pictures(folder):
+    staying = _pictures(folder) - names
+    if changed and staying:
         now |= dict.fromkeys(changed, "various")
-    if unknown := unknown & _pictures(folder) - names:
+    if unknown := unknown & staying:
         now[UNKNOWN] = sorted(unknown)
+    if others := staying if changed else unknown:
+        notice(f"kprender: {folder}: other pictures stay there, such as {min(others)}; {len(others):,} in all")
     with atomic_write(record) as temporary:
         temporary.write_text(json.dumps(now, indent=1) + "\n")
 
