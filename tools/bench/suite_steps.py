@@ -218,7 +218,7 @@ def _of_file(end: str, file: str, encode: str, frames: tuple[int, int], repeats:
         Step(f"stream{end}", ("stream", file, *timed), 0.5, (encode,)),
         Step(f"window{end}", ("window", file, "--seconds", "10", *timed), 1, (encode,), missing=_no_display),
         Step(f"steady{end}", steady, 1, (encode,), missing=_no_display),
-        Step(f"web{end}", ("web", file, "--size", "320x240", "640x480"), 1.5, (encode,), missing=_no_browser),
+        Step(f"web{end}", ("web", file), 4, (encode,), missing=_no_browser),
         Step(f"webload{end}", ("web", file, "--loading", *timed), 1.5, (encode,), missing=_no_browser),
     ]
 
