@@ -358,16 +358,23 @@ def stills_are_refined_in_bands(player: Player) -> None:
     """Refining row by row gives the picture that drawing it at once gives."""
     state, scene_view = player.state, player.scene_view
     state.playback.playing = False
-    with replaced(state.visible, controls=False), replaced(scene_view, band_s=1e-6):
+    level = state.quality.level
+    with (
+        replaced(state.visible, controls=False),
+        replaced(scene_view, band_s=1e-6),
+        replaced(state.quality, level=LEVEL_NAMES[0]),
+    ):
         state.look_from(state.view.orbit(0.1, 0.0))
         state.quality.resolution.scale = 0.25
         player.frame()
+        assert scene_view.level == LEVEL_NAMES[0] != level
         coarse = scene_view.pixels().astype(int)
         time.sleep(0.3)
         frames = 0
         while not player.snapshot().is_sharp:
             player.frame()
             frames += 1
+        assert scene_view.level == level
         fine = scene_view.pixels().astype(int)
         scene_view.draw_still()
         whole = scene_view.pixels()

@@ -27,6 +27,8 @@ from kpc.format.common.text import valid_unicode
 # Options of ffmpeg's scale filter for an exact colour conversion.
 SCALE_FLAGS = "bicubic+accurate_rnd+full_chroma_int+full_chroma_inp"
 
+FFMPEG_WHITE = 0xFF00  # white in the R'G'B' of 16 bits that ffmpeg's scale filter converts, as 8-bit white times 256
+
 
 @dataclass(frozen=True)
 class Codec:
@@ -198,7 +200,7 @@ def write_film(
                     raise MediaError(
                         f"{path}: frame {count} is {frame.dtype} {frame.shape}, the first {first.dtype} {first.shape}"
                     )
-                process.stdin.write(np.pad(frame, pad, mode="edge").tobytes())
+                process.stdin.write(np.pad(_for_ffmpeg(frame), pad, mode="edge").tobytes())
                 count += 1
             process.stdin.close()
             code = process.wait()
@@ -211,10 +213,19 @@ def write_film(
                 process.stdin.close()
         if code != 0:
             reason = main_error(read_log(log))
-            raise MediaError(
-                f"{path}: ffmpeg cannot write it ({reason}); it needs {film_format.encoder} and disk space"
-            )
+            raise MediaError(f"{path}: ffmpeg's encoder {film_format.encoder} cannot write {width}x{height} ({reason})")
     return count
+
+
+def _for_ffmpeg(frame: np.ndarray) -> np.ndarray:
+    """Return a frame whose 16-bit colours are multiples of 1/65280, as ffmpeg's scale filter takes them to be when it
+    converts to Y'CbCr; its alpha is of 65535.
+    """
+    if frame.dtype != np.uint16:
+        return frame
+    scaled = frame.copy()
+    scaled[..., :3] = np.rint(frame[..., :3] * (FFMPEG_WHITE / np.iinfo(np.uint16).max))
+    return scaled
 
 
 def write_video(

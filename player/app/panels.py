@@ -151,9 +151,10 @@ class Panels:
         """The quality level, and the frame rate to hold."""
         state, quality = self.state, self.state.quality
         label("quality")
-        number = LEVEL_NAMES.index(quality.level)
+        level = self.scene_view.level
+        number = LEVEL_NAMES.index(level)
         changed, wanted = imgui.slider_int(
-            "##quality", number, 0, len(LEVEL_NAMES) - 1, quality.level, imgui.SliderFlags.NO_INPUT
+            "##quality", number, 0, len(LEVEL_NAMES) - 1, level, imgui.SliderFlags.NO_INPUT
         )
         if changed and wanted != number:
             quality.choose(LEVEL_NAMES[wanted])

@@ -109,6 +109,11 @@ class SceneView:
             self._refine()
         return False
 
+    @property
+    def level(self) -> str:
+        """The quality level of the picture that is shown."""
+        return self.state.quality.still_level if self.is_sharp else self.state.quality.level
+
     def draw_still(self) -> None:
         """Draw the whole scene at once at the quality of a still."""
         self.draw(self.state.quality.still_level, still=True)
@@ -150,6 +155,7 @@ class SceneView:
         self._refined_rows = top + rows
         if self._refined_rows == height:
             self.is_sharp, self.raster = True, (width, height)
+            self._measure()
 
     def _quality(self, level: str, still: bool) -> Quality:
         """Return the quality to draw at.

@@ -71,6 +71,24 @@ def test_films_are_what_was_asked_for(
 
 
 @pytest.mark.parametrize(
+    ("suffix", "codec", "bits"),
+    [(".mp4", "h264", 8), (".mp4", "h264", 10), (".mp4", "hevc", 10), (".mov", "prores", 10), (".mkv", "vp9", 10)],
+)
+def test_black_grey_and_white_have_the_luma_of_limited_range(
+    tmp_path: Path, suffix: str, codec: str, bits: int
+) -> None:
+    """Y' = (219 E' + 16) 2^(bits - 8), ITU-R BT.709, section 3: 16 to 235 of 8 bits, 64 to 940 of 10 bits."""
+    path, shades = tmp_path / f"x{suffix}", (0.0, 0.5, 1.0)
+    kind = np.uint8 if bits == 8 else np.uint16
+    frames = [np.full((64, 64, 3), round(shade * np.iinfo(kind).max), kind) for shade in shades]
+    write_film(path, frames, 25, FilmFormat.of(suffix, codec, bits=bits))
+    with av.open(str(path)) as container:
+        lumas = [np.frombuffer(frame.planes[0], kind)[0] for frame in container.decode(video=0)]
+    wanted = [(219 * shade + 16) * 2 ** (bits - 8) for shade in shades]
+    np.testing.assert_allclose(lumas, wanted, atol=1)
+
+
+@pytest.mark.parametrize(
     ("suffix", "words", "message"),
     [
         (".mp4", {"codec": "prores"}, "it holds h264, hevc, av1; prores goes into .mov, .mkv"),
