@@ -82,11 +82,13 @@ def encode_groups(options: Options) -> dict[str, Any]:
             work=path.with_suffix(""),
             keep_checkpoint=options.keep_checkpoint or path.with_suffix(".kpck"),
         )
+        begun = time.monotonic()
         if options.resume and path.with_suffix(".json").exists():
             found.append(_read_finished(path, group_options))
         else:
             before = None if number == numbers[0] else group_path(work, number - 1).with_suffix(".kpck")
             found.append(_encode_group(group_options, setting_of_span(setting, span), before))
+        started -= found[-1]["encode_s"] - (time.monotonic() - begun)  # of runs that were interrupted
         if number == numbers[0] and found[0]["refine"] != "none" and has_static_cameras(setting.dataset):
             corrected = with_corrections(setting.dataset, found[0]["corrections"])
             setting = replace(setting, dataset=corrected, refined=found[0]["refine"])

@@ -58,6 +58,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     """Train on a dataset and write the file; return what was measured."""
     started = time.monotonic()
     trainer = prepare_trainer(options, setting)
+    started -= trainer.elapsed_s  # of runs that were interrupted
     if options.preview is not None:
         log(f"preview: {options.preview}, with the box, beside what was filmed")
     _check_size(options, setting, trainer)

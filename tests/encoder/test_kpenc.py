@@ -383,8 +383,8 @@ def test_a_killed_process_resumes(sets: Path, tmp_path: Path, run: Kpenc) -> Non
     assert not output.exists()
     state = torch.load(checkpoint, weights_only=True)
     code, out, err = run(sets / "blender", "--resume", "--json", "--steps", f"{(steps := state['step'] + 3)}")
-    assert code == 0 and f"--steps 1000000 before, --steps {steps} now" in err and json.loads(out)["steps"] == steps
-    assert {p.name for p in tmp_path.iterdir()} == {"out.kpc"}
+    assert code == 0 and f"--steps 1000000 before, --steps {steps} now" in err and {*tmp_path.iterdir()} == {output}
+    assert (made := json.loads(out))["steps"] == steps and made["encode_s"] > made["train_s"] + made["coding_s"]
 
 
 # --- bad input
