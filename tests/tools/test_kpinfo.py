@@ -191,6 +191,19 @@ def test_verify_lists_every_damaged_chunk(scene_file, capsys):
     assert not info["verified"] and "2 chunks are damaged" in info["error"] and info["clip"]["frame_count"] == 11
 
 
+def test_verify_names_no_plane_that_only_lacks_the_occupancy(scene_file, capsys):
+    data = bytearray(scene_file.read_bytes())
+    index = Reader(bytes(data)).index
+    planes = [number for number, entry in enumerate(index) if entry.kind == "PLNE"]
+    (occupancy,) = (number for number, entry in enumerate(index) if entry.kind == "OCCU")
+    for number in (occupancy, planes[-1]):
+        data[index[number].offset + index[number].stored_length // 2] ^= 0x10
+    scene_file.write_bytes(data)
+    assert kpinfo.main([str(scene_file), "--verify", "--json"]) == 1
+    (info,) = json_of(capsys)["files"]
+    assert [one["chunk"] for one in info["damaged_chunks"]] == [occupancy, planes[-1]]
+
+
 @pytest.mark.parametrize("chunk", [1, 6])  # DECO, PLNE
 def test_a_damaged_chunk_is_reported_in_every_form(scene_file, tmp_path, capsys, chunk):
     whole = tmp_path / "whole.kpc"
