@@ -12,7 +12,7 @@ if [ ! -f "$clip/gt/cameras.json" ]; then  # written last, so the clip is comple
     "$bin/python" -m kpc.tools.dev.scenegen "$clip"
 fi
 
-echo "encoding it: $scene (about three minutes of training on two cores)" >&2
+echo "encoding it: $scene (about two minutes on two cores)" >&2
 "$bin/kpenc" "$clip" -o "$scene" --preset fast
 
 echo "rendering novel views" >&2
