@@ -143,7 +143,8 @@ def find_tuned_limit(
         slope: expected change of log value per octave towards `end`, where no attempt says more.
 
     Returns:
-        The attempt with the largest value within the limit; None where there is none.
+        The attempt within the limit that is nearest to `end`; None where there is none. Values scatter by about a
+        tenth, so its value need not be the largest.
     """
     if not 0 < value(found) <= limit:
         return None
@@ -162,7 +163,7 @@ def find_tuned_limit(
         reached = value(candidate)
         if not reached > 0:  # true for NaN
             break
-        if reached <= limit and (best is None or reached > value(best)):
+        if reached <= limit and (best is None or (candidate.exponent - best.exponent) * slope > 0):
             best = candidate
         if (1 - enough) * limit <= reached <= limit:
             break
