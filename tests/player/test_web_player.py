@@ -281,8 +281,8 @@ def test_meshes_of_three_hide_and_are_hidden(name: str, results: dict[str, Any])
     # Three opaque squares, a part of one behind the clip, and a part of the one that can be seen through.
     assert [int((hit < np.inf).sum()) > 50 for hit in hits] == [True] * 4
     assert (hits[2] < np.inf)[~is_seen & (through[..., 0] < 0.1)].sum() > 50 and is_seen.sum() > 50
-    # Edges of squares, of which "target" has smooth ones, are off; there also what lies behind thin haze in channels that
-    # are nearly black, since 8 bits of linear light are coarse there.
+    # Edges of squares, of which "target" has smooth ones, are off; there also nearly black channels behind thin haze,
+    # for which 8 bits of linear light are coarse.
     assert np.mean(error <= 2 / 255) >= (0.93 if name == "target" else 0.98)
     assert psnr(picture, wanted) >= (27 if name == "target" else 34)
 

@@ -284,7 +284,8 @@ def test_a_dry_run_names_each_damaged_file_once(tmp_path: Path, capsys: pytest.C
     for words in [str(file)], [str(tmp_path / "none"), str(tmp_path / "broken.kpc")]:
         assert main([*words, "-o", str(tmp_path / "out"), "--dry-run"]) == 2
         missing, damaged = capsys.readouterr().err.splitlines()
-        assert "no such file" in missing and "chunk 11 (PLNE) is damaged" in damaged and "damaged" not in missing
+        assert "no such file" in missing and "damaged" not in missing
+        assert re.search(r"chunk \d+ \(PLNE\) is damaged", damaged)
     assert damaged.startswith(f"kpbatch: {tmp_path / 'broken.kpc'}: chunk") and not (tmp_path / "out").exists()
     with pytest.raises(FaultyBatch) as error:
         jobs.read_jobs(file, str(tmp_path / "out"))
@@ -694,7 +695,8 @@ def test_failures_are_listed_and_what_is_done_is_published(tmp_path: Path, capsy
     store.put_json({"size_bytes": 57_243, "test_psnr": 33.7}, f"{done.key}/{RESULT}")
     assert main([str(SAMPLE), str(broken), "-o", str(out), "--workers", "1", "--", *options]) == 1
     said = capsys.readouterr()
-    assert re.search(r"broken failed:\n.*broken.kpc: chunk 11 ", said.out) and "1 of 2 jobs failed" in said.err
+    assert re.search(r"broken failed:\n.*broken.kpc: chunk \d+ \(PLNE\) ", said.out)
+    assert "1 of 2 jobs failed" in said.err
     assert re.search(r"^default +57,243 +33.70 ", said.out, re.MULTILINE)
     assert (out / "default.kpc").read_bytes() == SAMPLE.read_bytes()
     assert json.loads((out / "default.json").read_text())["key"] == done.key
