@@ -24,9 +24,19 @@ def patches(seed: int = 0) -> np.ndarray:
     return colours.repeat(PATCH, 0).repeat(PATCH, 1)
 
 
+def _binary() -> str:
+    """Return the ffmpeg that makes videos: that of imageio-ffmpeg, since the one of Debian 12 cannot turn pictures."""
+    try:
+        import imageio_ffmpeg
+
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
+    except (ModuleNotFoundError, RuntimeError):
+        return ffmpeg_binary()
+
+
 def ffmpeg(*arguments: object, frames: bytes | None = None) -> None:
     """Run ffmpeg, with raw frames on its standard input."""
-    command = [ffmpeg_binary(), "-v", "error", "-y", *map(str, arguments)]
+    command = [_binary(), "-v", "error", "-y", *map(str, arguments)]
     done = subprocess.run(command, input=frames or b"", capture_output=True, check=False)
     assert done.returncode == 0, done.stderr.decode()
 

@@ -120,7 +120,7 @@ def generated(effort: Effort) -> list[Step]:
     trained = Step(
         "encode",
         ("encode", DEFAULT, "--preset", effort.preset, *effort.encode, "--keep-scenes", "kept"),
-        7,
+        8,
         ("scene",),
         (f"{main}.kpc", f"{main}.kpck"),
     )
@@ -138,7 +138,7 @@ def generated(effort: Effort) -> list[Step]:
         Step(
             f"curve-{preset}",
             ("curve", DEFAULT, "--preset", preset, "--minutes", minutes),
-            {"draft": 3, "fast": 2.5, "balanced": 3}[preset],
+            {"draft": 3, "fast": 2.5, "balanced": 4.5}[preset],
             ("scene",),
         )
         for preset, minutes in effort.curves.items()
@@ -160,13 +160,13 @@ def generated(effort: Effort) -> list[Step]:
         draft,
         *([fast] if effort is HOUR else []),
         *curves,
-        Step("ablate", ablate, 6.5, ("scene",)),
-        Step("scaling", ("scaling", "--steps", scaling_steps, "--repeats", effort.repeats), 9),
+        Step("ablate", ablate, 7, ("scene",)),
+        Step("scaling", ("scaling", "--steps", scaling_steps, "--repeats", effort.repeats), 6),
         long_clip,
         Step("groups", (*groups, "--test-views", "12"), 1, ("scene-long",)),
         Step("step", ("step", DEFAULT, "--preset", effort.preset, "--repeats", effort.repeats), 3, ("scene",)),
         *_of_file("", f"{main}.kpc", "encode", effort.frames, effort.repeats),
-        Step("codec", ("codec", f"{coded}.kpck", "--dataset", DEFAULT), 8, ("scene", "encode-draft")),
+        Step("codec", ("codec", f"{coded}.kpck", "--dataset", DEFAULT), 9, ("scene", "encode-draft")),
         Step("stability", ("stability",), 0.5),
         *_of_truth("", DEFAULT, f"{main}.kpc", ("scene", "encode"), effort.repeats),
     ]
@@ -218,7 +218,7 @@ def _of_file(end: str, file: str, encode: str, frames: tuple[int, int], repeats:
         Step(f"stream{end}", ("stream", file, *timed), 0.5, (encode,)),
         Step(f"window{end}", ("window", file, "--seconds", "10", *timed), 1, (encode,), missing=_no_display),
         Step(f"steady{end}", steady, 1, (encode,), missing=_no_display),
-        Step(f"web{end}", ("web", file), 4, (encode,), missing=_no_browser),
+        Step(f"web{end}", ("web", file), 5, (encode,), missing=_no_browser),
         Step(f"webload{end}", ("web", file, "--loading", *timed), 1.5, (encode,), missing=_no_browser),
     ]
 
