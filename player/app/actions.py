@@ -160,7 +160,7 @@ class Actions:
         self.state.notify(f"quality: {quality.level}, level {position} of {len(LEVEL_NAMES)}")
 
     def toggle_target_rate(self) -> None:
-        """Hold the target frame rate by changing the quality, or keep the present quality."""
+        """Hold the target frame rate by changing the quality, or keep the quality of still pictures."""
         quality = self.state.quality
         quality.hold(self.state.target_fps if quality.target_s is None else None)
 

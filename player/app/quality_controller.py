@@ -66,12 +66,13 @@ class QualityController:
         self._restart()
 
     def hold(self, fps: float | None) -> None:
-        """Change the level automatically to hold a frame rate; with None, keep the present level.
+        """Change the level automatically to hold a frame rate; with None, keep that of still pictures, so that these do
+        not change.
 
         If the resolution is reduced, begin with the fastest level: finer levels are only used at full resolution.
         """
         if fps is None:
-            self.chosen_level = self.level
+            self.chosen_level = self.level = self.still_level
         elif self.resolution.scale < 1.0:
             self.level = LEVEL_NAMES[0]
         self.resolution.forget()

@@ -110,6 +110,11 @@ def test_a_chosen_level_stays_and_stills_are_no_coarser_than_it() -> None:
     assert set(draw(controller, 100, load=0.1)) == {LEVEL_NAMES[1]} == {controller.still_level}
     assert controller.target_s is None
     controller.hold(30)
+    draw(controller, 200, load=40.0)
+    assert controller.level == LEVEL_NAMES[0]
+    controller.hold(None)
+    assert controller.chosen_level == controller.level == LEVEL_NAMES[1]
+    controller.hold(30)
     draw(controller, 200, load=0.01)
     assert controller.level == controller.still_level == LEVEL_NAMES[-1]
     controller.hold(None)

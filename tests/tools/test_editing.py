@@ -161,6 +161,13 @@ def test_a_part_shows_what_the_clip_shows_then(variant):
         assert np.array_equal(plane.symbols, whole.symbols[rows] * plane.coded[..., None])
 
 
+def test_a_part_of_whole_frames_keeps_the_frame_rate():
+    """Exactly, since `kpjoin` joins clips of one rate; 31 frames in 1.03 s were at 30.000000000000007."""
+    whole = replace(quantised(time=60), clip=Clip(60, 30.0))
+    for start, end in (0.5, 1.5), (0.1, 0.7), (1.0, 1.9):
+        assert trimmed(whole, start, end)[0].clip.fps == 30.0
+
+
 def test_planes_that_never_change_do_not_keep_a_clip_from_being_cut():
     """As those of the scales that `kpenc --layers auto` gives to what stands still: two equal rows."""
     whole = quantised(time=9)

@@ -126,8 +126,9 @@ def trimmed(scene: QuantisedScene, start_s: float, end_s: float) -> tuple[Quanti
             raise UsageError("--from, --to: the planes of the clip have no rows in common at which it can be cut")
         return scene, (0.0, duration_s)
     since_s, until_s = (row / parts * duration_s for row in (first, last))
-    frames = max(1, round((until_s - since_s) * scene.clip.fps))
-    sound, fps = scene.sound, frames / (until_s - since_s)
+    intervals, rows = scene.clip.frame_count - 1, last - first
+    frames = max(1, round(rows * intervals / parts))
+    sound, fps = scene.sound, scene.clip.fps * (frames * parts / (rows * intervals))  # exact where frames are whole
     if sound is not None:
         sound = sound.part(round(since_s * SAMPLE_RATE), round((frames + 1) / fps * SAMPLE_RATE))
     part = replace(
