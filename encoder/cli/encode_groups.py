@@ -100,7 +100,7 @@ def encode_groups(options: Options) -> dict[str, Any]:
     for one in found[1:]:
         one["size_bytes"] -= shared
     figures = _combine(found, [spans[number] for number in numbers], 0, options)
-    size = _join(parts, clip_metadata([part.metadata for part in parts], figures), options)
+    size = _join(parts, clip_metadata([part.metadata for part in parts], figures, options), options)
     if not options.keep:
         clear_work_folder(work, options.cache)
     return _combine(found, [spans[number] for number in numbers], size, options) | {

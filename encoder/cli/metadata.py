@@ -101,9 +101,18 @@ def with_figures(metadata: Metadata, result: Mapping[str, Any]) -> Metadata:
     )
 
 
-def clip_metadata(parts: Sequence[Metadata], result: Mapping[str, Any]) -> Metadata:
-    """Return the metadata of a clip of groups with figures of the whole; `result` as for `with_figures`."""
-    return with_figures(merged(list(parts)), result)
+def clip_metadata(parts: Sequence[Metadata], result: Mapping[str, Any], options: Options) -> Metadata:
+    """Return the metadata of a clip of groups with figures of the whole.
+
+    Args:
+        parts: of its groups.
+        result: as for `with_figures`.
+        options: of the clip, of which each group has its share of steps and bytes.
+    """
+    whole, (target, value) = merged(list(parts)), options.trade.bound
+    given = {"steps": options.steps, target: value}
+    chosen = whole.provenance.get("options", {}) | {name: one for name, one in given.items() if one is not None}
+    return with_figures(whole.with_provenance(options=chosen), result)
 
 
 def hash_dataset(dataset: Dataset) -> str:

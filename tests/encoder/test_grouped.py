@@ -308,6 +308,7 @@ def test_finished_groups_may_have_another_length_but_no_other_options(tmp_path, 
 @pytest.mark.usefixtures("searched")
 def test_a_clip_is_coded_anew_group_by_group(videos, tmp_path, capsys):
     assert encode(videos, tmp_path / "long.kpc", "--steps", "8") == 0
+    assert Groups(tmp_path / "long.kpc").metadata().provenance["options"]["steps"] == 8  # as given, for the first group
     capsys.readouterr()
     assert (
         kpenc.main(
