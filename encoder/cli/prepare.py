@@ -198,7 +198,8 @@ def find_layers(
         why = "the model is of another kind"
     elif dataset.is_dynamic:
         area, why = find_moving_area(dataset, aabb, mapping)
-    log(f"layers: {'all in one' if area is None else 'what moves has scales of its own'} ({why})")
+    own = f"what moves has scales of its own, with up to {config.moving_rows:g} times as many rows in time"
+    log(f"layers: {'all in one' if area is None else own} ({why})")
     return Layers(area)
 
 

@@ -129,7 +129,8 @@ def test_several_scenes_become_a_gallery(tmp_path: Path, quick_posters: None) ->
     scenes.mkdir()
     for name in ("one.kpc", "two 2.kpc"):
         shutil.copy(SAMPLE, scenes / name)
-    assert kpshare.main(["--gallery", str(scenes), "-o", str(folder)]) == 0
+    named_twice = str(scenes / "one.kpc")
+    assert kpshare.main(["--gallery", str(scenes), named_twice, "-o", str(folder)]) == 0
     gallery = Page((folder / "index.html").read_text())
     assert gallery.tags.count("img") == 2 and gallery.content("og:title") == "my scenes"
     pages = [address for address in gallery.addresses() if address.endswith("index.html")]

@@ -11,6 +11,7 @@ browser on this machine.
 
 import argparse
 import contextlib
+import os
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -42,7 +43,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def _command(argv: list[str]) -> None:
     options = _parser().parse_args(argv)
-    files = [Path(name) for name in Playlist.named([str(path) for path in _inputs(options)]).files]
+    named = Playlist.named([str(path) for path in _inputs(options)]).files
+    files = list({os.path.abspath(name): Path(name) for name in named}.values())  # each once, though named twice
     is_gallery = options.gallery is not None or len(files) > 1
     folder = options.output
     cli.check_writable(folder, is_folder=True)
