@@ -398,24 +398,20 @@ class RateController:
             gain,
             goal.slope,
         )
-        if better is not None and spent(better) < self._expected(found, goal, spent):
+        if better is not None and spent(better) < self._expected(found, goal, spent, by_size):
             return better
         found = self._search(goal, guess, tolerance, self._tried.values())
         return better if better is not None and spent(better) < spent(found) else found
 
-    def _expected(self, found: Attempt, goal: _Goal, spent: Callable[[Attempt], float]) -> float:
+    def _expected(self, found: Attempt, goal: _Goal, spent: Callable[[Attempt], float], by_size: bool) -> float:
         """Return what a coding without fine-tuning would spend at the limit, by one that is `found` within it.
 
         What is spent is taken as a power of the value: from `found` and the nearest attempt beyond the limit, or of the
         usual exponent where none was made.
         """
-        usual = BYTES_SLOPE / ERROR_SLOPE
-        power = -usual if goal.slope == ERROR_SLOPE else -1 / usual
-        value, nearest = goal.value(found), self._nearest_beyond(goal)
+        power = -ERROR_SLOPE / BYTES_SLOPE if by_size else -BYTES_SLOPE / ERROR_SLOPE
+        beyond = (one for one in self._tried.values() if goal.value(one) > goal.limit)
+        value, nearest = goal.value(found), min(beyond, key=goal.value, default=None)
         if nearest is not None and 0 < spent(nearest) < spent(found):
             power = math.log(spent(nearest) / spent(found)) / math.log(goal.value(nearest) / value)
         return spent(found) * (goal.limit / value) ** power
-
-    def _nearest_beyond(self, goal: _Goal) -> Attempt | None:
-        beyond = (one for one in self._tried.values() if goal.value(one) > goal.limit)
-        return min(beyond, key=goal.value, default=None)

@@ -264,16 +264,7 @@ def _damaged_in(
     return damaged or _differing(file, [chunk])
 
 
-def _differs(reader: SceneReader, number: int) -> bool:
-    """Return whether the CRC32C of a chunk differs."""
-    try:
-        reader.stored(number)
-    except FormatError:
-        return True
-    return False
-
-
-def _differing(file: Reader, numbers: Sequence[int] | None = None) -> list[tuple[int, str, FormatError]]:
+def _differing(file: Reader | SceneReader, numbers: Sequence[int] | None = None) -> list[tuple[int, str, FormatError]]:
     """Return number, kind and error of each chunk, of all or of these, whose CRC32C differs."""
     damaged = []
     for number in range(len(file.index)) if numbers is None else numbers:
@@ -306,7 +297,7 @@ def _damaged_chunks(file: Reader, memory: int, skipped: Collection[int] = ()) ->
         except FormatError as error:
             damaged.append((number, entry.kind, error))
     if any(kind == "OCCU" for _, kind, _ in damaged):  # without it no plane decodes, however whole
-        damaged = [one for one in damaged if one[1] != "PLNE" or _differs(reader, one[0])]
+        damaged = [one for one in damaged if one[1] != "PLNE" or _differing(reader, [one[0]])]
     if not damaged:
         reader.mapping(), reader.motion(), reader.decoder(), reader.occupancy()
         reader.cameras(), reader.appearances(), reader.metadata(), reader.sound()
