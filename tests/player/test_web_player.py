@@ -276,14 +276,13 @@ def test_meshes_of_three_hide_and_are_hidden(name: str, results: dict[str, Any])
     is_seen = hits[-1] < np.minimum(depth, way)
     wanted[is_seen] += last["opacity"] * (np.array(last["colour"]) - wanted[is_seen])
     wanted = (srgb_from_linear(wanted) if name == "target" else wanted).clip(0, 1)
-    error = np.abs(picture - wanted).max(axis=-1)
+    error = np.abs(light(picture) - light(wanted)).max(axis=-1)
     assert shot["error"] == 0 and found["hits"] == 1
     # Three opaque squares, a part of one behind the clip, and a part of the one that can be seen through.
     assert [int((hit < np.inf).sum()) > 50 for hit in hits] == [True] * 4
     assert (hits[2] < np.inf)[~is_seen & (through[..., 0] < 0.1)].sum() > 50 and is_seen.sum() > 50
-    # Edges of squares, of which "target" has smooth ones, are off; there also nearly black channels behind thin haze,
-    # for which 8 bits of linear light are coarse.
-    assert np.mean(error <= 2 / 255) >= (0.93 if name == "target" else 0.98)
+    # Edges of squares, of which "target" has smooth ones, are all that is off, in the light that is blended.
+    assert np.mean(error <= 2 / 255) >= (0.95 if name == "target" else 0.98)
     assert psnr(picture, wanted) >= (27 if name == "target" else 34)
 
 

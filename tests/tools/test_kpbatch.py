@@ -23,6 +23,7 @@ import pytest
 from distributed import Client, Future, LocalCluster
 
 from kpc.format.common.errors import UsageError
+from kpc.format.container.container import Reader
 from kpc.tools.batch import engine, jobs, simulation, summary, working
 from kpc.tools.batch.addresses import source_address
 from kpc.tools.batch.engine import Engine, Event
@@ -274,6 +275,13 @@ def test_files_that_cannot_be_coded_are_refused_before_anything_starts(
     assert main([names[2], "-o", str(tmp_path / "out"), "--dry-run"]) == 0 and not (tmp_path / "out").exists()
 
 
+def chunk_at(offset: int) -> int:
+    """Return the number of the sample's chunk that holds a byte."""
+    index = Reader(SAMPLE.read_bytes()).index
+    (number,) = (n for n, entry in enumerate(index) if entry.offset <= offset < entry.offset + entry.stored_length)
+    return number
+
+
 def test_a_dry_run_names_each_damaged_file_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Though a grid makes two jobs of it; encoding begins without reading files as a whole."""
     data = bytearray(SAMPLE.read_bytes())
@@ -285,7 +293,7 @@ def test_a_dry_run_names_each_damaged_file_once(tmp_path: Path, capsys: pytest.C
         assert main([*words, "-o", str(tmp_path / "out"), "--dry-run"]) == 2
         missing, damaged = capsys.readouterr().err.splitlines()
         assert "no such file" in missing and "damaged" not in missing
-        assert re.search(r"chunk \d+ \(PLNE\) is damaged", damaged)
+        assert f"chunk {chunk_at(20_000)} (PLNE) is damaged" in damaged
     assert damaged.startswith(f"kpbatch: {tmp_path / 'broken.kpc'}: chunk") and not (tmp_path / "out").exists()
     with pytest.raises(FaultyBatch) as error:
         jobs.read_jobs(file, str(tmp_path / "out"))
@@ -695,7 +703,7 @@ def test_failures_are_listed_and_what_is_done_is_published(tmp_path: Path, capsy
     store.put_json({"size_bytes": 57_243, "test_psnr": 33.7}, f"{done.key}/{RESULT}")
     assert main([str(SAMPLE), str(broken), "-o", str(out), "--workers", "1", "--", *options]) == 1
     said = capsys.readouterr()
-    assert re.search(r"broken failed:\n.*broken.kpc: chunk \d+ \(PLNE\) ", said.out)
+    assert re.search(rf"broken failed:\n.*broken.kpc: chunk {chunk_at(20_000)} \(PLNE\) ", said.out)
     assert "1 of 2 jobs failed" in said.err
     assert re.search(r"^default +57,243 +33.70 ", said.out, re.MULTILINE)
     assert (out / "default.kpc").read_bytes() == SAMPLE.read_bytes()
