@@ -85,9 +85,9 @@ def test_steps_are_commands_whose_needs_come_first(steps: list[Step], capsys: py
         assert {word.split("=")[0] for word in words if word.startswith("--")} <= known, step.name
 
 
-def test_generated_scenes_take_about_an_hour_and_make_every_kind() -> None:
+def test_generated_scenes_take_less_than_an_hour_and_make_every_kind() -> None:
     steps = suite_steps.generated(HOUR)
-    assert 50 < sum(step.minutes for step in steps) <= 65
+    assert sum(step.minutes for step in steps) <= 60
     made = {step.words[0] for step in steps}
     assert {command.split()[1] for command in COMMANDS.values()} - made == {"ceiling"}  # it takes an hour by itself
     timed = {"player", "stream", "window", "step", "scaling", "decode"}

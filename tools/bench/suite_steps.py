@@ -113,24 +113,24 @@ QUICK = Effort(
 def generated(effort: Effort) -> list[Step]:
     """Return the steps on generated scenes."""
     scenegen = ("kpc.tools.dev.scenegen",)
-    long_clip = Step("scene-long", (*scenegen, LONG, *effort.long), 0.3, (), (f"{LONG}/gt/cameras.json",), False)
-    scene = Step("scene", (*scenegen, DEFAULT, *effort.scene), 0.8, (), (f"{DEFAULT}/gt/cameras.json",), False)
+    long_clip = Step("scene-long", (*scenegen, LONG, *effort.long), 0.1, (), (f"{LONG}/gt/cameras.json",), False)
+    scene = Step("scene", (*scenegen, DEFAULT, *effort.scene), 0.6, (), (f"{DEFAULT}/gt/cameras.json",), False)
     ablate_steps, scaling_steps, group_steps = map(str, effort.steps)
     main = f"kept/default-{effort.preset}"
     trained = Step(
         "encode",
         ("encode", DEFAULT, "--preset", effort.preset, *effort.encode, "--keep-scenes", "kept"),
-        8,
+        7,
         ("scene",),
         (f"{main}.kpc", f"{main}.kpck"),
     )
-    fast = Step("encode-fast", ("encode", DEFAULT, "--preset", "fast", "--keep-scenes", "kept"), 2.5, ("scene",))
+    fast = Step("encode-fast", ("encode", DEFAULT, "--preset", "fast", "--keep-scenes", "kept"), 2.2, ("scene",))
     # The coder is compared on the draft, since what it searches takes longest.
     coded = "kept/default-draft" + "-0" * (effort.repeats != "1")
     draft = Step(
         "encode-draft",
         ("encode", DEFAULT, "--preset", "draft", *effort.encode, "--repeats", effort.repeats, "--keep-scenes", "kept"),
-        3,
+        2.2,
         ("scene",),
         (f"{coded}.kpck",),
     )
@@ -163,7 +163,7 @@ def generated(effort: Effort) -> list[Step]:
         Step("ablate", ablate, 7, ("scene",)),
         Step("scaling", ("scaling", "--steps", scaling_steps, "--repeats", effort.repeats), 6),
         long_clip,
-        Step("groups", (*groups, "--test-views", "12"), 1, ("scene-long",)),
+        Step("groups", (*groups, "--test-views", "12"), 0.8, ("scene-long",)),
         Step("step", ("step", DEFAULT, "--preset", effort.preset, "--repeats", effort.repeats), 3, ("scene",)),
         *_of_file("", f"{main}.kpc", "encode", effort.frames, effort.repeats),
         Step("codec", ("codec", f"{coded}.kpck", "--dataset", DEFAULT), 9, ("scene", "encode-draft")),
@@ -210,14 +210,14 @@ def _of_file(end: str, file: str, encode: str, frames: tuple[int, int], repeats:
             minutes,
             (encode,),
         )
-        for size, minutes in (("320x240", 1.5), ("640x480", 4))
+        for size, minutes in (("320x240", 1.3), ("640x480", 3.5))
     ]
     steady = ("steady", file, "--frames", str(frames[1]))
     return [
         *player,
-        Step(f"stream{end}", ("stream", file, *timed), 0.5, (encode,)),
-        Step(f"window{end}", ("window", file, "--seconds", "10", *timed), 1, (encode,), missing=_no_display),
-        Step(f"steady{end}", steady, 1, (encode,), missing=_no_display),
+        Step(f"stream{end}", ("stream", file, *timed), 0.2, (encode,)),
+        Step(f"window{end}", ("window", file, "--seconds", "10", *timed), 1.6, (encode,), missing=_no_display),
+        Step(f"steady{end}", steady, 0.4, (encode,), missing=_no_display),
         Step(f"web{end}", ("web", file), 5, (encode,), missing=_no_browser),
         Step(f"webload{end}", ("web", file, "--loading", *timed), 1.5, (encode,), missing=_no_browser),
     ]
@@ -226,10 +226,10 @@ def _of_file(end: str, file: str, encode: str, frames: tuple[int, int], repeats:
 def _of_truth(end: str, dataset: str, file: str, needs: tuple[str, ...], repeats: str = REPEATS) -> list[Step]:
     """Return the steps that decode a file and compare it with the truth; their names have an `end`."""
     return [
-        Step(f"entropy{end}", ("entropy", file), 0.3, needs),
-        Step(f"decode{end}", ("decode", file, "--repeats", repeats), 0.3, needs),
-        Step(f"quality{end}", ("quality", file, dataset), 0.5, needs),
-        Step(f"pictures{end}", ("pictures", file, dataset), 0.3, needs),
+        Step(f"entropy{end}", ("entropy", file), 0.6, needs),
+        Step(f"decode{end}", ("decode", file, "--repeats", repeats), 0.1, needs),
+        Step(f"quality{end}", ("quality", file, dataset), 0.1, needs),
+        Step(f"pictures{end}", ("pictures", file, dataset), 0.1, needs),
     ]
 
 
