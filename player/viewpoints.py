@@ -7,6 +7,7 @@ import numpy as np
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rig import Rig, surround_focus
 from kpc.format.scene.scene import Scene
+from kpc.format.scene.view_limits import OPENING_ASPECT
 
 # The fraction of the angles between cameras on one side that viewpoints use: what lies beyond was not filmed.
 USED_FRACTION = 0.7
@@ -75,13 +76,25 @@ def presets(scene: Scene) -> dict[str, Camera]:
 
 def fit_camera(camera: Camera, width: int, height: int) -> Camera:
     """Return a camera for a raster of another size; vertical field of view and shape of pixels stay the same."""
-    scale = height / camera.height
+    return _scaled(camera, width, height, height / camera.height)
+
+
+def fit_window(camera: Camera, width: int, height: int) -> Camera:
+    """Return a camera for a window, whose sides show no more than a picture of OPENING_ASPECT or the camera's own does.
+
+    A window that is wider shows less above and below; in others the vertical field of view stays the same.
+    """
+    widest = max(camera.width, OPENING_ASPECT * camera.height)
+    return _scaled(camera, width, height, max(height / camera.height, width / widest))
+
+
+def _scaled(camera: Camera, width: int, height: int, scale: float) -> Camera:
     return Camera(
         width,
         height,
         camera.fl_x * scale,
         camera.fl_y * scale,
         width / 2 + (camera.cx - camera.width / 2) * scale,
-        camera.cy * scale,
+        height / 2 + (camera.cy - camera.height / 2) * scale,
         camera.camera_to_world,
     )

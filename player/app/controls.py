@@ -8,7 +8,7 @@ import numpy as np
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Clip, Scene
-from kpc.player.viewpoints import fit_camera
+from kpc.player.viewpoints import fit_window
 
 # Orbiting stops at this angle from looking straight up or down, radians.
 MIN_POLAR_ANGLE = math.radians(1.0)
@@ -54,10 +54,10 @@ class OrbitView:
         return self.focus + self.distance * self.axes[:, 2]
 
     def camera(self, width: int, height: int) -> Camera:
-        """Return the camera for a raster of this size."""
+        """Return the camera for a window of this size."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = self.axes, self.eye
-        return replace(fit_camera(self.lens, width, height), camera_to_world=pose)
+        return replace(fit_window(self.lens, width, height), camera_to_world=pose)
 
     def orbit(self, right: float, up: float) -> "OrbitView":
         """Drag the scene by two angles in radians; the eye moves the other way around the focus."""

@@ -32,6 +32,13 @@ def test_a_view_of_a_camera_is_that_camera() -> None:
         assert (got.fl_x, got.fl_y, got.cx, got.cy) == (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
 
 
+def test_a_very_wide_window_shows_no_more_at_its_sides() -> None:
+    wide, widest = (opening().camera(width, 720) for width in (1280, 1920))
+    assert wide.fl_y / 720 == pytest.approx(SCENE.cameras[0].fl_y / SCENE.cameras[0].height)
+    assert widest.fl_x / 1920 == pytest.approx(wide.fl_x / 1280)
+    assert (widest.cx - 960, widest.cy - 360) == pytest.approx((1.5 * (wide.cx - 640), 1.5 * (wide.cy - 360)))
+
+
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(st.floats(-4, 4), st.floats(-4, 4)), max_size=12))
 def test_orbiting_keeps_focus_and_distance_and_stays_upright(drags: list[tuple[float, float]]) -> None:

@@ -281,6 +281,14 @@ def test_several_files_with_totals(scene_file, tmp_path, capsys):
     assert kpinfo.main([*files, "--group", "0"]) == 2
 
 
+def test_totals_are_of_files_that_can_be_read(scene_file, tmp_path, capsys):
+    other = tmp_path / "other.kpc"
+    other.write_bytes(b"not a scene" * 1000)
+    assert kpinfo.main([str(scene_file), str(other), "--json"]) == 1
+    totals = json_of(capsys)["totals"]
+    assert (totals["files"], totals["failed"], totals["size_bytes"]) == (2, 1, scene_file.stat().st_size)
+
+
 def test_single_and_grouped_files_have_the_same_keys(scene_file, tmp_path, capsys):
     long = tmp_path / "long.kpc"
     groups.write([groups.GroupInput.of(scene_file, start) for start in (0, 11)], long)

@@ -55,6 +55,14 @@ def test_chunks_that_are_no_planes(scene, kinds, tmp_path, capsys):
     assert (sums["groups"], sums["frame_count"]) == ((1, 22) if is_described else (0, 0))
 
 
+def test_a_file_that_is_cut_off_and_damaged(scene, tmp_path, capsys):
+    cut = damaged(scene, offsets(scene)["came"])[: Reader(scene).index[-1].offset]
+    info, _ = verified(tmp_path / "x.kpc", cut, capsys)
+    (found,) = info["damaged_chunks"]
+    assert found["kind"] == "came" and f"chunk {found['chunk']} (came) is damaged" in info["error"]
+    assert f"cut off at {len(cut):,} of {len(scene):,} bytes" in info["error"]
+
+
 def test_chunks_of_several_groups_and_beside_them(scene, tmp_path, capsys):
     path = tmp_path / "long.kpc"
     parts = [groups.GroupInput.of(scene, first) for first in (0, 22, 44)]

@@ -14,7 +14,7 @@ from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common import cli
 from kpc.format.common.errors import BudgetError, FormatError, KpcError, UsageError
 from kpc.format.common.progress import in_parts, progress
-from kpc.format.common.text import counted
+from kpc.format.common.text import agreeing, counted
 from kpc.format.container.clip_sound import SoundSpan, sound_spans
 from kpc.format.container.container import Beside, Codec, Entry, Reader
 from kpc.format.container.groups import Groups
@@ -126,11 +126,12 @@ def _describe_file(groups: Groups, only: int | None, info: dict[str, Any]) -> No
 
 def totals(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return sums over the files that could be read, as far as they are known."""
-    clips = [info["clip"] for info in files if info["clip"] is not None]
+    known = [info for info in files if info["clip"] is not None]
+    clips = [info["clip"] for info in known]
     return {
         "files": len(files),
         "failed": sum(info["error"] is not None for info in files),
-        "size_bytes": sum(info["size_bytes"] or 0 for info in files),
+        "size_bytes": sum(info["size_bytes"] for info in known),
         "frame_count": sum(clip["frame_count"] for clip in clips),
         "duration_s": sum(clip["duration_s"] for clip in clips),
         "groups": sum(len(info["groups"]) for info in files),
@@ -205,11 +206,9 @@ def _verify(file: Reader, group: int | None, memory: int, info: dict[str, Any]) 
     Raises:
         FormatError: chunks are damaged, or the end of the file is missing.
     """
-    if info["size_bytes"] < info["expected_bytes"]:
-        raise FormatError(
-            f"{file.name}: cut off at {info['size_bytes']:,} of {info['expected_bytes']:,} bytes; fetch the file again"
-        )
     errors, found = [], info["damaged_chunks"]
+    if info["size_bytes"] < info["expected_bytes"]:
+        raise _cut_off(file, info)
     file.source.will_read(0, file.source.size)
     chunks = [number for number, entry in enumerate(file.index) if entry.kind == GROUP_KIND]
     is_single = not chunks
@@ -231,14 +230,31 @@ def _verify(file: Reader, group: int | None, memory: int, info: dict[str, Any]) 
         errors.append(error)
         found.append({"group": None, "chunk": number, "kind": kind})
     if len(errors) > 1:
-        named = [
-            f"{one['chunk']} ({one['kind']})" + (f" of group {one['group']}" if one["group"] is not None else "")
-            for one in found
-        ]
-        listed = ", ".join(named[:DAMAGED_SHOWN]) + ", ..." * (len(named) > DAMAGED_SHOWN)
-        raise FormatError(f"{file.name}: {len(found)} chunks are damaged: {listed}; fetch the file again")
+        raise FormatError(f"{file.name}: {len(found)} chunks are damaged: {_listed(found)}; fetch the file again")
     if errors:
         raise errors[0]
+
+
+def _cut_off(file: Reader, info: dict[str, Any]) -> FormatError:
+    """Return what to say of a file whose end is missing; set `damaged_chunks` to those of what is there."""
+    whole = [number for number in range(len(file.index)) if file.available(number)]
+    damaged = [{"group": None, "chunk": number, "kind": kind} for number, kind, _ in _differing(file, whole)]
+    info["damaged_chunks"] = damaged
+    chunks, are = agreeing(len(damaged), "chunk", "chunks"), agreeing(len(damaged), "is", "are")
+    damage = f"; of what is there, {chunks} {_listed(damaged)} {are} damaged" if damaged else ""
+    return FormatError(
+        f"{file.name}: cut off at {info['size_bytes']:,} of {info['expected_bytes']:,} bytes{damage}; "
+        "fetch the file again"
+    )
+
+
+def _listed(damaged: Sequence[Mapping[str, Any]]) -> str:
+    """Return the first of some chunks in words."""
+    named = [
+        f"{one['chunk']} ({one['kind']})" + (f" of group {one['group']}" if one["group"] is not None else "")
+        for one in damaged
+    ]
+    return ", ".join(named[:DAMAGED_SHOWN]) + ", ..." * (len(named) > DAMAGED_SHOWN)
 
 
 def _damaged_in(

@@ -98,9 +98,11 @@ test('panning keeps what is under the pointer, zooming and flying move the eye',
   );
 });
 
-test('a picture shows the height of the lens, and more of it where it is narrow', () => {
-  const wide = cameraOf(start, 1920, 720);
-  assertNear([wide.focal[1] / 720, wide.centre[0]], [600 / 480, 960]);
+test('a picture shows the height of the lens, more where it is narrow, and less where it is very wide', () => {
+  const wide = cameraOf(start, 1280, 720);
+  assertNear([wide.focal[1] / 720, wide.centre[0]], [600 / 480, 640]);
+  const widest = cameraOf(start, 1920, 720);
+  assertNear([widest.focal[0] / 1920, ...widest.centre], [wide.focal[0] / 1280, 960, 360]);
   const narrow = cameraOf(start, 480, 960);
   assert.ok(narrow.focal[1] / 960 < 600 / 480 && narrow.focal[0] / 480 > 600 / 640);
   assertNear(eyeOf(wide), eyeOfView(start));

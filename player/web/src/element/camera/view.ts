@@ -9,6 +9,8 @@ const MIN_POLAR_ANGLE = Math.PI / 180;
 /** Distance over that before, for each notch of the wheel, and bounds of the distance, world units. */
 const [ZOOM_FACTOR, MIN_DISTANCE, MAX_DISTANCE] = [0.9, 1e-4, 1e6];
 const DECIMALS = 4;
+/** The shape, width over height, in which encoders see to it that the opening view holds. */
+const OPENING_ASPECT = 16 / 9;
 
 export interface View {
   /** The camera whose intrinsics to use; its pose is ignored. */
@@ -33,12 +35,14 @@ export function viewOf(rig: Rig, camera: Camera): View {
 
 /**
  * Return the camera for a picture of this size. Its height shows what the lens's does; a picture that is narrower than
- * the lens's, as on an upright telephone, shows more above and below so that it need not lose as much at the sides.
+ * the lens's, as on an upright telephone, shows more above and below so that it need not lose as much at the sides. One
+ * that is wider than that and than OPENING_ASPECT shows less above and below, and no more at the sides.
  */
 export function cameraOf(view: View, width: number, height: number): Camera {
   const { lens, axes } = view;
   const [byWidth, byHeight] = [width / lens.width, height / lens.height];
-  const scale = byWidth < byHeight ? Math.sqrt(byWidth * byHeight) : byHeight;
+  const widest = Math.max(lens.width, OPENING_ASPECT * lens.height);
+  const scale = byWidth < byHeight ? Math.sqrt(byWidth * byHeight) : Math.max(byHeight, width / widest);
   return {
     width,
     height,
