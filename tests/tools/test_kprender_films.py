@@ -2,6 +2,7 @@
 
 import argparse
 import itertools
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -264,6 +265,7 @@ def test_resuming_knows_a_scene_by_its_content_and_keeps_no_secret(run: Run, sce
     assert run(scene_file, *SIZE, "--frames", "0-0", "-o", out)[0] == 0
     renamed = shutil.copy(scene_file, tmp_path / "renamed.kpc")
     assert run(renamed, *SIZE, "--frames", "0-1", "--resume", "-o", out)[0] == 0
+    assert json.loads((out / RECORD).read_text())["part"] == "full"
     (out / RECORD).unlink()
     code, _, printed = run(renamed, *SIZE, "--frames", "0-1", "--resume", "-o", out)
     assert code == 2 and "what they show is not known" in printed

@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Collection, Iterator
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +115,9 @@ def described(options: argparse.Namespace) -> dict[str, Any]:
     for name, value in sorted(vars(options).items()):
         if name in FREE:
             continue
-        if isinstance(value, np.ndarray):
+        if isinstance(value, Enum):
+            value = value.value
+        elif isinstance(value, np.ndarray):
             value = [float(number) for number in value]
         elif isinstance(value, str | Path) and Path(value).is_file():
             value = f"{Path(value).name}, {_checksum(Path(value).read_bytes())}"
