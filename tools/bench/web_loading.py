@@ -36,12 +36,15 @@ PICTURE_SIZE, SPACING = (128, 96), 1 / 100
 
 KPC_PAGE = """<!doctype html><meta charset="utf-8"><title>KPC</title>
 <style>body { margin: 0 } kpc-player { display: block; width: %dpx; height: %dpx }</style>
-<script>document.addEventListener('loadeddata', () => firstPicture(), true);</script>
+<script>document.addEventListener('loadeddata', ({ target }) => {
+  const canvas = target.shadowRoot.querySelector('canvas');
+  whenDone(canvas.getContext('webgl2'), firstPicture);
+}, true);</script>
 <script type="module" src="kpc-player.js"></script>
 <kpc-player src="%s" %s muted></kpc-player>
 """
-# How often a clip follows itself in the one that is sought in, and its bytes at least: a second of the line.
-REPEATS, SOUGHT_BYTES = 6, 1_250_000
+# How often a clip follows itself in the one that is sought in, and its bytes at least: four seconds of the line.
+REPEATS, SOUGHT_BYTES = 6, 5_000_000
 SPLAT_PAGE = """<!doctype html><meta charset="utf-8"><title>Splats</title><style>body { margin: 0 }</style>
 <script>globalThis.view = %s;</script><body><script type="module" src="splat_page.js"></script>
 """

@@ -4,8 +4,8 @@
  * A page calls `firstPicture()` once it shows something. Writes a list as JSON: milliseconds from navigation to that,
  * the longest task of the page's main thread until then, by the clock and by its processor time, bytes fetched, and
  * frames a second that are drawn on the canvas in the SECONDS after that. Of a page named seeks.html it writes instead
- * milliseconds from a seek to the first picture there: once to the end of a clip of which nothing but the beginning has
- * arrived, then to and fro within what is buffered there.
+ * milliseconds from a seek to the first picture there: once, a second after the first picture, to the end of a clip of
+ * which nothing but the beginning has arrived, then to and fro within what is buffered there.
  */
 
 import { readFileSync } from 'node:fs';
@@ -20,12 +20,23 @@ const LINE = { offline: false, latency: 40, downloadThroughput: 1.25e6, uploadTh
 const TYPES = { '.html': 'text/html', '.js': 'text/javascript' };
 const [executablePath, folder, seconds, ...pages] = process.argv.slice(2);
 
-/** In the page: note the first picture, and the frames in which something is drawn on a canvas. */
+/** In the page: note the first picture, the frames in which something is drawn on a canvas, and when that is done. */
 function watch() {
-  globalThis.found = { first: 0, frames: [] };
+  globalThis.found = { first: 0, frames: [], done: [] };
   globalThis.firstPicture = () => {
     globalThis.found.first ||= performance.now();
     performance.mark('first picture');
+  };
+  /** Call something once the card has done what it has been given. */
+  globalThis.whenDone = (gl, act) => {
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    const look = () => {
+      const isDone = gl.isContextLost() || gl.getSyncParameter(fence, gl.SYNC_STATUS) === gl.SIGNALED;
+      if (isDone) act();
+      else setTimeout(look, 2);
+    };
+    look();
   };
   const { prototype } = WebGL2RenderingContext;
   let isOnCanvas = true;
@@ -40,7 +51,14 @@ function watch() {
     prototype[name] = function (...args) {
       draw.apply(this, args);
       const now = document.timeline.currentTime;
-      if (isOnCanvas && now !== last) globalThis.found.frames.push(now);
+      if (isOnCanvas && now !== last) {
+        const frame = globalThis.found.frames.push(now) - 1;
+        queueMicrotask(() => {
+          globalThis.whenDone(this, () => {
+            globalThis.found.done[frame] = performance.now();
+          });
+        });
+      }
       last = isOnCanvas ? now : last;
     };
   }
@@ -126,7 +144,7 @@ async function measure(address, name) {
 /** In the page: seek in a paused clip once it shows its beginning; return milliseconds until pictures are drawn. */
 async function seeks() {
   const player = document.querySelector('kpc-player');
-  const { frames } = globalThis.found;
+  const { frames, done } = globalThis.found;
   const nextFrame = () => new Promise(requestAnimationFrame);
   /** Return the buffered part of the clip that holds a time; null if it is not buffered. */
   const bufferedAt = (time) => {
@@ -136,20 +154,25 @@ async function seeks() {
     return null;
   };
   const seek = async (time) => {
-    const start = document.timeline.currentTime;
+    const start = performance.now();
     player.currentTime = time;
     while (player.seeking) await nextFrame();
     const seeked = document.timeline.currentTime;
-    while (!(frames.at(-1) >= seeked)) await nextFrame();
-    return frames.find((at) => at >= seeked) - start;
+    const isDone = (_, frame) => frames[frame] >= seeked;
+    while (!done.some(isDone)) await nextFrame();
+    return done.find(isDone) - start;
+  };
+  const aSecond = async () => {
+    for (let i = 0; i < 60; i++) await nextFrame();
   };
   const end = 0.8 * player.duration;
+  await aSecond();
   if (bufferedAt(end) !== null) throw new Error('the end of the clip arrived before it was sought');
   const unbuffered = await seek(end);
   const places = [0.1, 0.7, 0.3, 0.9, 0.5];
   const buffered = [];
   for (const share of places) {
-    for (let i = 0; i < 60; i++) await nextFrame();
+    await aSecond();
     const [from, to] = bufferedAt(player.currentTime);
     buffered.push(await seek(from + share * (to - from)));
   }
