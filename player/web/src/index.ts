@@ -39,6 +39,7 @@ export type { Moment, ShownPart } from './render/picture_job.js';
 export { LEVEL_NAMES, type Level } from './render/quality.js';
 export { type DrawnPicture, type DrawOptions, type Frame, Renderer, type RendererOptions } from './render/renderer.js';
 export { Clip, type ClipOptions, type ClipPosition, SceneEvent, type ScenePart } from './streaming/clip.js';
-export type { SceneStream, TexelRows } from './streaming/scene_stream.js';
+export type { SceneStream } from './streaming/scene_stream.js';
+export type { TexelRows } from './streaming/texel_queue.js';
 
 define();

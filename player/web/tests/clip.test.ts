@@ -9,7 +9,7 @@ import { isTimePlane, PLANES, type PlaneHead } from '../src/container/scene_chun
 import { loadCore } from '../src/decoder/module.js';
 import { layerTexels } from '../src/decoder/texels.js';
 import { Clip, type SceneEvent } from '../src/streaming/clip.js';
-import type { TexelRows } from '../src/streaming/scene_stream.js';
+import type { TexelRows } from '../src/streaming/texel_queue.js';
 import { read } from './files.js';
 import { spawnScript } from './node_worker.js';
 import { hasCode, until, withClip } from './playing.js';

@@ -2,7 +2,8 @@
 
 import { type ErrorCode, KpcError } from '../src/container/errors.js';
 import { Clip, type ClipOptions } from '../src/streaming/clip.js';
-import type { SceneStream, TexelRows } from '../src/streaming/scene_stream.js';
+import type { SceneStream } from '../src/streaming/scene_stream.js';
+import type { TexelRows } from '../src/streaming/texel_queue.js';
 import { spawnNode } from './node_worker.js';
 
 /** Return what says whether an error has a code, and words in its message. */

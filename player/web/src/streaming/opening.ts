@@ -4,8 +4,10 @@ import type { Entry } from '../container/chunk.js';
 import { Container, HEADER_LENGTH, readHeader } from '../container/container.js';
 import { BudgetError, FormatError } from '../container/errors.js';
 import { KNOWN_KINDS } from '../container/scene.js';
+import { PLANES, type PlaneHead } from '../container/scene_chunks.js';
 import type { DecoderPool } from '../decoder/pool.js';
 import type { SceneContent } from '../decoder/tasks.js';
+import { layerCount } from '../decoder/texels.js';
 import { emptyError, reaches, type Source } from './source.js';
 
 /** Read header and index of a file; the index, which is compressed, in a worker, whose time is limited. */
@@ -71,4 +73,19 @@ export async function readContent(
   const isSharing = index.some(({ offset }) => offset > header.fileLength);
   const task = { kind: 'scene', start, index: isSharing ? index : undefined, bodies, memoryBudget: memory } as const;
   return pool.run(task, { signal });
+}
+
+/** Bytes that a scene takes whatever is shown of it: textures of planes, and grids. */
+export function contentBytes({ head, occupancy, motion }: SceneContent): number {
+  const copies = head.isDynamic ? 2 : 1; // space planes as halves, and once more with time rows folded in
+  let planes = 0;
+  for (const scale of head.scales) {
+    for (const name of PLANES.slice(0, 3)) {
+      const { rows, columns, channels } = scale[name] as PlaneHead;
+      planes += 8 * rows * columns * layerCount(channels) * copies;
+    }
+  }
+  const cells = occupancy.occupied.length * (2 + 1 / occupancy.sizes[0]) + occupancy.content.length;
+  const grid = motion ? 4 * motion.displacements.length * (1 + 4 / 3 / motion.sizes[0]) : 0;
+  return planes + cells + grid;
 }

@@ -17,7 +17,7 @@ import { occupancySlot } from '../render/scene_source.js';
 import { BegunSource } from './begun.js';
 import { CellDistances } from './cell_distances.js';
 import { FIRST_BYTES } from './http.js';
-import { adjacentRuns, isThere, openContainer, readContent } from './opening.js';
+import { adjacentRuns, contentBytes, isThere, openContainer, readContent } from './opening.js';
 import {
   fetchOrder,
   isNeeded,
@@ -31,6 +31,7 @@ import {
 import type { SharedPlanes } from './shared_source.js';
 import { SoundStream } from './sound_stream.js';
 import type { Source } from './source.js';
+import { TexelQueue, type TexelRows } from './texel_queue.js';
 import { TimePlane } from './time_plane.js';
 
 /** The most that is fetched with one request, so that a jump of the playhead does not wait long. */
@@ -42,17 +43,6 @@ const OVERLAP_BYTES = 1 << 16;
 const WAITING_BYTES = 1 << 23;
 /** Seconds of the clip that must have arrived before playback continues after it had to wait. */
 const RESUME_S = 0.5;
-
-/** Rows of a space plane: halves [row][layer][column][4]. */
-export interface TexelRows {
-  scale: number;
-  plane: PlaneName;
-  firstRow: number;
-  rowCount: number;
-  columns: number;
-  layers: number;
-  texels: Uint16Array;
-}
 
 export interface SceneStreamOptions {
   /** The group of the clip. */
@@ -106,7 +96,7 @@ export class SceneStream {
   readonly #requests = new Set<Request>();
   #keep: boolean[];
   #head: Playhead = { time: 0, rate: 0, loop: true };
-  #pieces: { position: number; texels: Uint16Array; takenRows: number }[] = [];
+  readonly #texels = new TexelQueue();
   #isStalled = true;
   readonly #ending = new AbortController();
   #isResting = false;
@@ -227,27 +217,9 @@ export class SceneStream {
 
   /** Take finished rows of space planes, at most so many bytes or one row. */
   take(mostBytes: number): TexelRows[] {
-    const taken: TexelRows[] = [];
-    let left = mostBytes;
-    while (left > 0 && this.#pieces.length) {
-      const piece = this.#pieces[0];
-      const { number } = this.#segments[piece.position];
-      const { name, plane } = this.#planeOf(number);
-      const layers = layerCount(plane.channels);
-      const length = layers * plane.columns * 4; // halves of a row
-      const rows = piece.texels.length / length;
-      const firstRow = piece.takenRows;
-      const rowCount = Math.min(rows - firstRow, Math.max(1, Math.floor(left / (2 * length))));
-      piece.takenRows += rowCount;
-      left -= 2 * length * rowCount;
-      const texels = piece.texels.subarray(firstRow * length, piece.takenRows * length);
-      const { scale } = this.#container.index[number];
-      taken.push({ scale, plane: name, firstRow, rowCount, columns: plane.columns, layers, texels });
-      if (piece.takenRows === rows) {
-        this.#pieces.shift();
-        this.#state[piece.position] = State.Held;
-      }
-    }
+    const taken = this.#texels.take(mostBytes, (position) => {
+      this.#state[position] = State.Held;
+    });
     if (taken.length) {
       this.version++;
       this.#schedule();
@@ -269,7 +241,7 @@ export class SceneStream {
 
   /** Hand out all space planes again: the renderer has lost them. */
   restore(): void {
-    for (const piece of this.#pieces) piece.takenRows = 0;
+    this.#texels.rewind();
     for (const [position, segment] of this.#segments.entries()) {
       if (!segment.isTime && this.#state[position] === State.Held) this.#state[position] = State.Wanted;
     }
@@ -350,13 +322,10 @@ export class SceneStream {
 
   /** Bytes that the scene takes beside segments of time planes: textures, grids, sound, texels that wait, requests. */
   get fixedBytes(): number {
-    const { head, occupancy, motion } = this.#content;
     const largest = Math.max(...this.#segments.map(({ number }) => this.#texelBytes(number)));
     const stored = Math.max(...this.#container.index.map((entry) => (entry.kind === 'PLNE' ? entry.storedLength : 0)));
-    const cells = occupancy.occupied.length * (2 + 1 / occupancy.sizes[0]) + occupancy.content.length;
-    const grid = motion ? 4 * motion.displacements.length * (1 + 4 / 3 / motion.sizes[0]) : 0;
     const coming = WAITING_BYTES + largest + FIRST_BYTES + 2 * (RUN_BYTES + stored);
-    return textureBytes(head) + cells + grid + this.sound.memoryBytes + coming;
+    return contentBytes(this.#content) + this.sound.memoryBytes + coming;
   }
 
   /** End all requests and let go of everything. */
@@ -366,7 +335,7 @@ export class SceneStream {
     this.#source.close();
     for (const request of this.#requests) request.control.abort();
     for (const scale of this.#timePlanes) for (const plane of Object.values(scale)) plane.clear();
-    this.#pieces = [];
+    this.#texels.clear();
   }
 
   #planeOf(number: number): { name: PlaneName; plane: PlaneHead } {
@@ -482,7 +451,8 @@ export class SceneStream {
       const result = await this.#pool.run(task, options);
       if (this.#ending.signal.aborted) return;
       if (result instanceof Uint16Array) {
-        this.#pieces.push({ position, texels: result, takenRows: 0 });
+        const { columns, channels } = plane;
+        this.#texels.add(position, { scale, plane: name, columns, layers: layerCount(channels) }, result);
         this.#state[position] = State.Waiting;
       } else {
         this.#timePlane(number).put(entry.rowStart, result);
@@ -522,17 +492,4 @@ export class SceneStream {
     this.error = asKpcError(error);
     this.#changed();
   }
-}
-
-/** Bytes of the textures of a scene: space planes as halves, and once more with time rows folded in. */
-export function textureBytes(head: SceneContent['head']): number {
-  const copies = head.isDynamic ? 2 : 1;
-  let bytes = 0;
-  for (const scale of head.scales) {
-    for (const name of PLANES.slice(0, 3)) {
-      const { rows, columns, channels } = scale[name] as PlaneHead;
-      bytes += 8 * rows * columns * layerCount(channels) * copies;
-    }
-  }
-  return bytes;
 }
