@@ -13,9 +13,6 @@ if TYPE_CHECKING:
 
 # Tests work on tiny arrays, for which threads cost more time in synchronisation than they save.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# Threads of numba's kernels sleep between them: those that wait by spinning, as OpenMP's do by default, take more than
-# half of the processor time of tests. PyTorch's and numba's OpenMP read this as they are loaded.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 # Garbage is collected less often: importing the tests, and compiling, make millions of objects that stay.
 gc.set_threshold(10_000)
 

@@ -9,6 +9,10 @@ picture = kpc.render(scene, scene.cameras[0], time=0.5).rgb     # (H, W, 3) floa
 import os
 from importlib import import_module
 
+# Threads of OpenMP, which numba and PyTorch read this for as they are loaded, sleep while they wait. GNU's spin by
+# default: two encodes at once, on two cores, then train for three times as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 TYPE_CHECKING = False  # as in typing, whose import would take longer than all else here, while Ctrl-C ends nothing yet
 if TYPE_CHECKING:
     from typing import Any, BinaryIO
