@@ -1,5 +1,7 @@
 """What speaks against a model of cameras."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from kpc.encoder.poses.doubts import confirmed_shares, doubts
@@ -49,6 +51,15 @@ def test_matches_that_contradict_the_model_are_named():
 def test_views_that_only_fit_each_other_are_named():
     (said,) = doubts("photographs", NAMES, structure(line(4), apart=(7, 8, 9)))
     assert said.startswith("cam07, cam08, cam09 fit each other but not the rest")
+
+
+def test_few_points_are_named():
+    model = structure(line(5))
+    views = {number: replace(view, points=[90, 20, 60, 40, 300][number]) for number, view in model.views.items()}
+    (said,) = doubts("still rig", NAMES, replace(model, views=views))
+    assert said.startswith("views see few points (20 to 300 each)")
+    views = {number: replace(view, points=[90, 20, 160, 140, 300][number]) for number, view in model.views.items()}
+    assert doubts("still rig", NAMES, replace(model, views=views)) == []
 
 
 def test_cameras_at_one_point_are_named_in_a_rig_only():
