@@ -165,6 +165,42 @@ def test_usd_of_other_programs_is_turned_and_scaled(tmp_path: Path) -> None:
     assert (lens.width, lens.height) == (320, 90) and math.isclose(lens.fl_x, 360) and math.isclose(lens.fl_y, 360)
 
 
+def test_a_camera_that_turns_with_what_holds_it_is_sampled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed, which reads and writes USD")
+    (tmp_path / "turn.usda").write_text(
+        '#usda 1.0\n(\n    metersPerUnit = 1\n    timeCodesPerSecond = 24\n    upAxis = "Y"\n)\n'
+        'def Xform "rig"\n{\n    float xformOp:rotateY.timeSamples = { 24: 0, 72: 360, 96: 360 }\n'
+        '    uniform token[] xformOpOrder = ["xformOp:rotateY"]\n    def Camera "cam"\n    {\n'
+        '        double3 xformOp:translate = (0, 1, 4)\n        uniform token[] xformOpOrder = ["xformOp:translate"]\n'
+        "    }\n}\n"
+    )
+    assert kpexport.main([str(tmp_path / "turn.usda"), "-o", str(tmp_path / "out.json")]) == 0
+    found = load_views(tmp_path / "out.json")
+    assert [view.at_s for view in found] == pytest.approx([1 + number / 24 for number in range(49)] + [4.0])
+    assert [view.time for view in found] == pytest.approx([number / 72 for number in range(49)] + [1.0])
+    angles = 2 * math.pi * np.arange(49) / 48
+    eyes = np.stack([view.camera.camera_to_world[:3, 3] for view in found[:49]])
+    assert np.abs(eyes - np.stack([4 * np.sin(angles), np.ones(49), 4 * np.cos(angles)], axis=1)).max() < 1e-5
+    assert "sampled 24 times a second" in capsys.readouterr().err
+
+
+def test_a_camera_that_jumps_stays_until_it_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_views(tmp_path / "in.json", views(True))
+    out = tmp_path / "path.gltf"
+    assert kpexport.main([str(tmp_path / "in.json"), "-o", str(out), "--keyframes"]) == 0
+    document = json.loads(out.read_text())
+    for sampler in document["animations"][0]["samplers"]:
+        sampler["interpolation"] = "STEP"
+    out.write_text(json.dumps(document))
+    assert kpexport.main([str(out), "-o", str(tmp_path / "out.json")]) == 0
+    found = load_views(tmp_path / "out.json")
+    assert [view.at_s for view in found] == pytest.approx([0.5 + number / 24 for number in range(85)])
+    nearest = [int(np.abs(np.array(EYES) - view.camera.camera_to_world[:3, 3]).max(1).argmin()) for view in found]
+    assert nearest == [0] * 24 + [1] * 60 + [2]
+    assert [found[number].time for number in (0, 12, 24, 54, 84)] == pytest.approx([0, 0.15, 0.3, 0.45, 0.6])
+    assert "sampled 24 times a second" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("edit", "reason"),
     [

@@ -1,11 +1,15 @@
 """Cameras between `cameras.json` and the files of other programs: still cameras, or one that moves along a path."""
 
+import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from kpc.format.common.errors import DatasetError, UsageError
 from kpc.format.scene.cameras import MAX_SIDE, Camera, View, load_views
+from kpc.format.scene.rotations import quaternion_of, rotation_of, slerp
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.viewpoints import fit_camera
 from kpc.tools.exchange.placement import Placement
@@ -14,6 +18,11 @@ from kpc.tools.exchange.placement import Placement
 MAX_VIEWS = 100_000
 # The width of a picture where a file does not say.
 DEFAULT_WIDTH = 1920
+# Instants a second where a camera does not move linearly between its keys, unless the file has a rate.
+SAMPLED_FPS = 24.0
+# The share of the way between two keys at which that is looked at, and how far off it may be: of the extent of the
+# path, and in the entries of a rotation. Half-way, a whole turn would look like none.
+LOOKED_AT, TOLERANCE = 0.382, 1e-3
 
 
 @dataclass(frozen=True)
@@ -83,6 +92,64 @@ def views_of(path: str, tracks: Sequence[Track], name: str | None) -> list[View]
     if len(tracks) > 1 and any(track.is_moving for track in tracks):
         raise UsageError(f"{path}: has several cameras, of which some move; choose one with --camera: {names}")
     return [view for track in tracks for view in track.views]
+
+
+def with_instants_between(
+    where: str, keys: np.ndarray, poses: Callable[[np.ndarray], np.ndarray], step: float
+) -> np.ndarray:
+    """Return the instants of a camera's keys, and others where it does not move linearly between two: it turns with
+    what holds it, say, or jumps.
+
+    Args:
+        where: the camera, which begins messages.
+        keys: (N,) increasing.
+        poses: of the camera at instants, (M,) to (M, 4, 4).
+        step: between the instants that are added, in the unit of the keys.
+
+    Raises:
+        DatasetError: there are more than MAX_VIEWS.
+    """
+    if len(keys) < 2:
+        return keys
+    ends, gaps = poses(keys), np.diff(keys)
+    looked_at = poses(keys[:-1] + LOOKED_AT * gaps)
+    extent = float(np.ptp(ends[:, :3, 3], axis=0).max())
+    found = [keys[:1]]
+    for number, gap in enumerate(gaps):
+        linear = _between(ends[number], ends[number + 1], LOOKED_AT)
+        moved, turned = linear[:3, 3] - looked_at[number, :3, 3], linear[:3, :3].T @ looked_at[number, :3, :3]
+        is_linear = np.linalg.norm(moved) <= TOLERANCE * extent and np.linalg.norm(turned - np.eye(3)) <= TOLERANCE
+        count = 1 if is_linear else max(math.ceil(gap / step - 1e-6), 1)
+        found.append(keys[number] + gap * np.arange(1, count + 1) / count)
+        if sum(map(len, found)) > MAX_VIEWS:
+            raise DatasetError(
+                f"{where}: sampled between its keys, it has more than {MAX_VIEWS} instants; export fewer"
+            )
+    return np.concatenate(found)
+
+
+def _between(one: np.ndarray, two: np.ndarray, share: float) -> np.ndarray:
+    """Return the pose at a share of the way, along a line and a great circle of rotations."""
+    pose = (1 - share) * one + share * two
+    turns = quaternion_of(np.stack([one[:3, :3], two[:3, :3]]))
+    pose[:3, :3] = rotation_of(slerp(turns[:1], turns[1:], np.full((1, 1), share))[0])
+    return pose
+
+
+def sampled_note(fps: float) -> str:
+    """Return what to say of a camera to which instants were added."""
+    return f"between keys the camera jumps, or turns with what holds it: it is sampled {fps:g} times a second there"
+
+
+def times_at(instants: np.ndarray, keys: np.ndarray, times: Sequence[float] | None) -> list[float]:
+    """Return the clip's times at instants, from those at keys; without them, the clip plays once along the path."""
+    if len(keys) < 2:
+        return [0.0] if times is None else list(times)
+    if times is None:
+        return ((instants - keys[0]) / (keys[-1] - keys[0])).tolist()
+    loops = np.concatenate([[0], np.cumsum(np.diff(times) < 0)])
+    whole = np.interp(instants, keys, np.asarray(times) + loops)
+    return [float(time if time <= 1 else time % 1) for time in whole]
 
 
 def placed(tracks: Sequence[Track], placement: Placement) -> list[Track]:

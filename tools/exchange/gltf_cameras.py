@@ -15,16 +15,23 @@ import numpy as np
 
 from kpc.format.scene.camera_checks import check_lens, check_pose, number_of
 from kpc.format.scene.cameras import Camera, View
-from kpc.format.scene.rotations import quaternion_of, rotation_of
-from kpc.tools.exchange.camera_tracks import MAX_VIEWS, Track, fitted, size_for
+from kpc.format.scene.rotations import quaternion_of, rotation_of, slerp
+from kpc.tools.exchange.camera_tracks import (
+    MAX_VIEWS,
+    SAMPLED_FPS,
+    Track,
+    fitted,
+    sampled_note,
+    size_for,
+    times_at,
+    with_instants_between,
+)
 from kpc.tools.exchange.gltf import GltfReader, GltfWriter
 
 NEAR = 0.01
 # The deepest chain of parents that a node may have.
 MAX_DEPTH = 64
 PATHS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
-# Quaternions whose dot product is above this are interpolated linearly.
-NEARLY_EQUAL = 0.9995
 
 
 def write_gltf_cameras(path: Path, tracks: Sequence[Track]) -> list[str]:
@@ -181,22 +188,31 @@ def _track(
     cx, cy = _centre(stored, width, height)
     check_lens(where, (width, height), (fl_x, fl_y, cx, cy))
 
+    def poses(instants: np.ndarray) -> np.ndarray:
+        found = np.broadcast_to(np.eye(4), (len(instants), 4, 4))
+        for number, one in chain:
+            found = _matrices(reader, number, one, channels, instants) @ found
+        axes = np.linalg.norm(found[:, :3, :3], axis=1, keepdims=True)  # a parent may scale
+        rigid = found.copy()
+        rigid[:, :3, :3] /= np.where(axes > 0, axes, 1.0)
+        for pose in rigid:
+            check_pose(where, pose)
+        return rigid
+
     animated = [channels[n, path][0] for n, _ in chain for path in PATHS if (n, path) in channels]
-    instants = np.unique(np.concatenate(animated)) if animated else np.zeros(1)
-    if len(instants) > MAX_VIEWS:
+    keys = np.unique(np.concatenate(animated)) if animated else np.zeros(1)
+    if len(keys) > MAX_VIEWS:
         raise reader.error(f"camera {name[:40]!r} has more than {MAX_VIEWS} instants")
-    times: Any = stored.get("time")
-    if not _are_times(times, len(instants)):
-        times = np.linspace(0, 1, len(instants)).tolist()
+    stored_times: Any = stored.get("time")
+    known = stored_times if _are_times(stored_times, len(keys)) else None
+    if known is None:
         guessed.add("there are no times of the clip: it plays once along the path" if animated else "all times are 0")
-    poses = np.broadcast_to(np.eye(4), (len(instants), 4, 4))
-    for number, one in chain:
-        poses = _matrices(reader, number, one, channels, instants) @ poses
+    instants = with_instants_between(where, keys, poses, 1 / SAMPLED_FPS)
+    if len(instants) > len(keys):
+        guessed.add(sampled_note(SAMPLED_FPS))
     views = []
-    for k, (pose, time) in enumerate(zip(poses, times, strict=True)):
-        axes = np.linalg.norm(pose[:3, :3], axis=0)  # a parent may scale
-        rigid = pose / np.append(np.where(axes > 0, axes, 1.0), 1.0)
-        made = Camera(width, height, fl_x, fl_y, cx, cy, check_pose(where, rigid))
+    for k, (pose, time) in enumerate(zip(poses(instants), times_at(instants, keys, known), strict=True)):
+        made = Camera(width, height, fl_x, fl_y, cx, cy, pose)
         file, at_s = (f"{k:04d}.png", float(instants[k])) if animated else (f"{name}.png", None)
         views.append(View(fitted(made, size), float(time), file, at_s))
     return Track(name, tuple(views))
@@ -268,10 +284,4 @@ def _sampled(channel: tuple[np.ndarray, np.ndarray, bool], path: str, instants: 
     a, b, share = values[before], values[after], share[:, None]
     if path != "rotation":
         return np.asarray((1 - share) * a + share * b)
-    cosine = (a * b).sum(1, keepdims=True)
-    b, cosine = np.where(cosine < 0, -b, b), np.abs(cosine)
-    angle = np.arccos(np.clip(cosine, -1, 1))
-    sine = np.where(cosine < NEARLY_EQUAL, np.sin(angle), 1.0)
-    along = np.where(cosine < NEARLY_EQUAL, np.sin((1 - share) * angle) / sine, 1 - share) * a
-    along += np.where(cosine < NEARLY_EQUAL, np.sin(share * angle) / sine, share) * b
-    return np.asarray(along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12))
+    return slerp(a, b, share)

@@ -9,7 +9,7 @@ A stage is y-up, in metres. Apertures and focal lengths count as millimetres; th
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,16 @@ from kpc.format.common.errors import DatasetError, MediaError
 from kpc.format.common.text import check_unicode, valid_unicode
 from kpc.format.scene.camera_checks import check_lens, check_pose
 from kpc.format.scene.cameras import Camera, View
-from kpc.tools.exchange.camera_tracks import MAX_VIEWS, Track, fitted, size_for
+from kpc.format.scene.rotations import quaternion_of, rotation_of
+from kpc.tools.exchange.camera_tracks import (
+    MAX_VIEWS,
+    Track,
+    fitted,
+    sampled_note,
+    size_for,
+    times_at,
+    with_instants_between,
+)
 from kpc.tools.exchange.gltf import MAX_FILE_BYTES
 
 FILM_WIDTH_MM = 36.0
@@ -151,17 +160,27 @@ def _track(
 ) -> Track:
     """Return the track of a camera of a stage, y-up and in metres."""
     prim = camera.GetPrim()
-    codes = _codes(where, camera)
-    rate = stage.GetTimeCodesPerSecond()
-    if not 0 < rate < 1e6:
-        raise DatasetError(f"{where}: {rate:g} time codes a second; correct the file")
+    rate, fps = stage.GetTimeCodesPerSecond(), stage.GetFramesPerSecond()
+    if not (0 < rate < 1e6 and 0 < fps < 1e6):
+        raise DatasetError(f"{where}: {rate:g} time codes and {fps:g} frames a second; correct the file")
+
+    def poses(codes: np.ndarray) -> np.ndarray:
+        return np.stack([_rigid(_pose(where, stage, camera, Usd.TimeCode(code))) for code in codes])
+
+    keys = np.array(_codes(where, camera))
+    are_all = _has_keyed_matrix(stage, camera)
+    codes = (keys if are_all else with_instants_between(where, keys, poses, rate / fps)).tolist()
+    if len(codes) > len(keys):
+        guessed.add(sampled_note(fps))
     time = prim.GetAttribute("kpc:time")
     if not time:
         guessed.add("there are no times of the clip: it plays once along the path" if codes else "all times are 0")
     stored = prim.GetAttribute("kpc:size")
     stored_size = [int(n) for n in stored.Get()] if stored and stored.GetTypeName() == Sdf.ValueTypeNames.Int2 else None
     name, views = _name(prim), []
-    for number, code in enumerate([Usd.TimeCode(code) for code in codes] or [Usd.TimeCode.Default()]):
+    known = [_time(where, time, code) for code in _time_codes(keys)] if time else None
+    times = times_at(np.array(codes), keys, known)
+    for number, code in enumerate(_time_codes(codes)):
         focal, film_width, film_height, shift_x, shift_y = (
             _number(where, attribute, code)
             for attribute in (
@@ -179,12 +198,11 @@ def _track(
         fl_x, fl_y = focal / film_width * width, focal / film_height * height
         cx, cy = (0.5 - shift_x / film_width) * width, (0.5 + shift_y / film_height) * height
         check_lens(where, (width, height), (fl_x, fl_y, cx, cy))
-        at = _number(where, time, code) if time else number / max(len(codes) - 1, 1)
-        if not 0 <= at <= 1:
-            raise DatasetError(f"{where}: kpc:time {at:g} lies outside [0, 1]; correct the file")
         file, at_s = (f"{number:04d}.png", codes[number] / rate) if codes else (f"{name}.png", None)
-        made = Camera(width, height, fl_x, fl_y, cx, cy, check_pose(where, _pose(where, stage, camera, code)))
-        views.append(View(fitted(made, size), at, file, at_s))
+        pose = _pose(where, stage, camera, code)
+        is_between = bool(codes) and codes[number] not in keys  # where USD may interpolate the entries of matrices
+        made = Camera(width, height, fl_x, fl_y, cx, cy, _rigid(pose) if is_between else check_pose(where, pose))
+        views.append(View(fitted(made, size), times[number], file, at_s))
     return Track(name, tuple(views))
 
 
@@ -209,6 +227,36 @@ def _codes(where: str, camera: UsdGeom.Camera) -> list[float]:
     if len(codes) > MAX_VIEWS:
         raise DatasetError(f"{where}: more than {MAX_VIEWS} time samples; export fewer")
     return sorted(codes)
+
+
+def _has_keyed_matrix(stage: Usd.Stage, camera: UsdGeom.Camera) -> bool:
+    """Return whether all that moves a camera is one matrix, whose rotation programs interpolate in their own way."""
+    prim, moving = camera.GetPrim(), []
+    while prim and not prim.IsPseudoRoot():
+        if prim.IsA(UsdGeom.Xformable):
+            moving += [op for op in UsdGeom.Xformable(prim).GetOrderedXformOps() if op.MightBeTimeVarying()]
+        prim = prim.GetParent()
+    is_matrix = len(moving) == 1 and moving[0].GetOpType() == UsdGeom.XformOp.TypeTransform
+    return is_matrix and stage.GetInterpolationType() == Usd.InterpolationTypeLinear
+
+
+def _rigid(pose: np.ndarray) -> np.ndarray:
+    """Return a pose with the nearest rotation, as far as it is one."""
+    rigid = pose.copy()
+    rigid[:3, :3] = rotation_of(quaternion_of(pose[:3, :3]))
+    return rigid
+
+
+def _time_codes(codes: Iterable[float]) -> list[Usd.TimeCode]:
+    return [Usd.TimeCode(float(code)) for code in codes] or [Usd.TimeCode.Default()]
+
+
+def _time(where: str, attribute: Any, code: Usd.TimeCode) -> float:
+    """Return the clip's time that a file stores."""
+    found = _number(where, attribute, code)
+    if not 0 <= found <= 1:
+        raise DatasetError(f"{where}: kpc:time {found:g} lies outside [0, 1]; correct the file")
+    return found
 
 
 def _number(where: str, attribute: Any, code: Usd.TimeCode) -> float:
