@@ -71,6 +71,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         trainer.save(checkpoint)
         if not _wants_partial(trainer, checkpoint, may_ask=options.group_s is None):
             raise
+        options = replace(options, keep=True)  # what training goes on from
     try:
         return _write(options, setting, trainer, started)
     except KeyboardInterrupt:
@@ -103,7 +104,13 @@ def _write(options: Options, setting: Setting, trainer: Trainer, started: float)
         return _evaluate_unwritable(trainer, options, started)
     scene, pictures = to_scene(trainer), _select_cameras(dataset)
     refine = trainer.config.refine if setting.refined == "none" else setting.refined
-    described = replace(options, audio=setting.sound_from, refine=Options.refine if refine == "none" else refine)
+    described = replace(
+        options,
+        audio=setting.sound_from,
+        refine=Options.refine if refine == "none" else refine,
+        # Ctrl-C or the time budget may have ended training at another step.
+        steps=options.steps if trainer.step == trainer.config.steps else trainer.step,
+    )
     dataset_sha256 = setting.dataset_sha256 or hash_dataset(setting.dataset)
     metadata = describe(described, dataset, scene, pictures, dataset_sha256)
     scene = replace(scene, metadata=metadata, sound=setting.sound)

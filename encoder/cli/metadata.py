@@ -110,7 +110,7 @@ def clip_metadata(parts: Sequence[Metadata], result: Mapping[str, Any], options:
         options: of the clip, of which each group has its share of steps and bytes.
     """
     whole, (target, value) = merged(list(parts)), options.trade.bound
-    given = {"steps": options.steps, target: value}
+    given = {"steps": options.steps, "time_budget_s": options.time_budget_s, target: value}
     chosen = whole.provenance.get("options", {}) | {name: one for name, one in given.items() if one is not None}
     return with_figures(whole.with_provenance(options=chosen), result)
 

@@ -13,7 +13,7 @@ from kpc.encoder.cli.sound import check_sound, sound_of_span
 from kpc.encoder.cli.work_folder import POSES
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.datasets.loading import has_layout, layouts_of
-from kpc.encoder.poses.footage import find_footage
+from kpc.encoder.poses.footage import find_footage, videos_by_name
 from kpc.format.common.errors import UsageError
 from kpc.format.common.media_files import is_hidden, is_image, is_video
 from kpc.format.common.text import notice
@@ -70,11 +70,13 @@ def check_folder(options: Options) -> None:
     """Refuse a folder that holds nothing to encode, or options that do not apply to it.
 
     Raises:
-        DatasetError: it has neither a layout nor footage.
+        DatasetError: it has neither a layout nor footage, or two videos have one name.
         UsageError, TrainingError: as for `read_dataset`.
     """
     if not _has_footage(options.source):
         layouts_of(options.source)
+    elif not has_layout(options.source):
+        videos_by_name(options.source)
     _refuse_early(options)
 
 

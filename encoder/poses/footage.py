@@ -35,7 +35,7 @@ def find_footage(root: Path) -> tuple[Footage, ...]:
         DatasetError: the folder holds nothing of these kinds, or several.
         MediaError: a video cannot be read.
     """
-    videos, folders = _videos(root), _frame_folders(root)
+    videos, folders = videos_by_name(root), _frame_folders(root)
     images = [file for file in media_in(root) if is_image(file)]
     if videos:
         return tuple(Footage(name, (file,), video_info(file)) for name, file in videos.items())
@@ -49,8 +49,12 @@ def find_footage(root: Path) -> tuple[Footage, ...]:
     return tuple(Footage(file.stem, (file,), None) for file in sorted(images, key=lambda file: natural_key(file.name)))
 
 
-def _videos(root: Path) -> dict[str, Path]:
-    """Return the videos of a folder, or else those of its folders, which then name the cameras."""
+def videos_by_name(root: Path) -> dict[str, Path]:
+    """Return the videos of a folder, or else those of its folders, which then name the cameras.
+
+    Raises:
+        DatasetError: two have one name.
+    """
     found = [file for file in media_in(root) if is_video(file)]
     if not found:
         found = [file for folder in _folders(root) for file in media_in(folder) if is_video(file)]

@@ -1,5 +1,6 @@
 """What keys and panels can make a player do."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from kpc.format.common.images import write_image
@@ -267,6 +268,23 @@ class Actions:
         with state.reporting_errors(file):
             self._path_to_load = CameraPath.load(file), file
             self.load_waiting_path()
+
+    def drop(self, files: Sequence[str]) -> None:
+        """Open what was dropped on the window: camera paths, and the first of the scenes; others follow it."""
+        scenes = [file for file in files if not file.lower().endswith(".json")]
+        for file in files:
+            if file not in scenes:
+                self.open(file)
+        if not scenes:
+            return
+        if self.asks or (len(scenes) == 1 and not Path(scenes[0]).is_dir()):
+            self.open(scenes[0])
+            return
+        with self.state.reporting_errors(scenes[0]):
+            first, *others = self.playlist.add(scenes)
+            self.open(first)
+            if others:
+                self.state.notify(f"opening {Path(first).name}; {len(others)} more in the playlist")
 
     def load_waiting_path(self) -> None:
         """Take over the camera path that was opened last, once the one that is there is saved or given up."""

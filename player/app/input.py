@@ -171,9 +171,9 @@ class Input:
         self._fly(min(seconds, MAX_FLY_S))
         for pressed in self.window.take_keys():
             press(self.actions, pressed)
-        chosen = self.actions.dialog.take_chosen()
-        for file in (*self.window.take_dropped_files(), *([] if chosen is None else [chosen])):
-            self.actions.open(file)
+        self.actions.drop(self.window.take_dropped_files())
+        if (chosen := self.actions.dialog.take_chosen()) is not None:
+            self.actions.open(chosen)
         self.actions.load_waiting_path()
 
     def _move_pointer(self) -> None:

@@ -1,5 +1,6 @@
 """The files that a player goes through, and those that were opened lately. No window."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
@@ -39,20 +40,21 @@ class Playlist:
             UsageError: a folder has no .kpc files.
             OSError: a folder cannot be read.
         """
-        files: list[str] = []
-        for argument in arguments:
-            if not Path(argument).is_dir():
-                files.append(argument)
-                continue
-            found = sorted(
-                str(path)
-                for path in Path(argument).iterdir()
-                if path.suffix.lower() == ".kpc" and not path.name.startswith(".") and not path.is_dir()
-            )
-            if not found:
-                raise UsageError(f"{argument}: this folder has no .kpc files; name a file, or another folder")
-            files += found
-        return Playlist(files, recent)
+        return Playlist(_files_of(arguments), recent)
+
+    def add(self, arguments: Sequence[str]) -> list[str]:
+        """Put files after the present one, unless they are in the playlist, and return them.
+
+        Args:
+            arguments: paths, of which a folder stands for files as for `named`.
+
+        Raises:
+            UsageError, OSError: as for `named`.
+        """
+        files = _files_of(arguments)
+        new = [file for file in files if self._position_of(file) is None]
+        self.files[self.position + 1 : self.position + 1] = new
+        return files
 
     def step(self, count: int) -> str:
         """Go `count` files forward, round the ends, and return the file there."""
@@ -66,11 +68,36 @@ class Playlist:
             file: its path or address.
             public_name: its absolute path, or its address without what is secret.
         """
-        if self.files[self.position] != file:
-            if file not in self.files:
-                self.files.insert(self.position + 1, file)
-            self.position = self.files.index(file)
+        if _identity(self.files[self.position]) != _identity(file):
+            self.add([file])
+            self.position = self._position_of(file) or 0
         self.recent = (public_name, *(name for name in self.recent if name != public_name))[:MAX_RECENT]
+
+    def _position_of(self, file: str) -> int | None:
+        identities = [_identity(one) for one in self.files]
+        return identities.index(_identity(file)) if _identity(file) in identities else None
+
+
+def _files_of(arguments: Sequence[str]) -> list[str]:
+    files: list[str] = []
+    for argument in arguments:
+        if is_url(argument) or not Path(argument).is_dir():
+            files.append(argument)
+            continue
+        found = sorted(
+            str(path)
+            for path in Path(argument).iterdir()
+            if path.suffix.lower() == ".kpc" and not path.name.startswith(".") and not path.is_dir()
+        )
+        if not found:
+            raise UsageError(f"{argument}: this folder has no .kpc files; name a file, or another folder")
+        files += found
+    return files
+
+
+def _identity(file: str) -> str:
+    """Return what is the same for all names of a file: it may be given by a relative path and an absolute one."""
+    return file if is_url(file) else os.path.abspath(file)
 
 
 def menu_names(files: Sequence[str]) -> list[str]:

@@ -8,6 +8,7 @@ from enum import Enum, auto
 
 import numpy as np
 
+from kpc.format.common.cli import print_error
 from kpc.format.common.errors import KpcError
 from kpc.format.common.text import escaped
 from kpc.format.scene.rig import Rig
@@ -228,10 +229,14 @@ class PlayerState:
 
     @contextlib.contextmanager
     def reporting_errors(self, subject: object) -> Iterator[None]:
-        """Show errors of the block as a message; `subject`, say a file name, precedes those of the operating system."""
+        """Show errors of the block as a message, and on the terminal.
+
+        Args:
+            subject: what precedes errors of the operating system, say a file name.
+        """
         try:
             yield
-        except KpcError as error:
-            self.notify_error(str(error))
-        except OSError as error:
-            self.notify_error(f"{subject}: {error.strerror or error}")
+        except (KpcError, OSError) as error:
+            text = f"{subject}: {error.strerror or error}" if isinstance(error, OSError) else str(error)
+            self.notify_error(text)
+            print_error("kpplay", text)

@@ -300,6 +300,17 @@ def test_a_dry_run_names_each_damaged_file_once(tmp_path: Path, capsys: pytest.C
     assert len(error.value.faults) == 1
 
 
+def test_what_kpenc_would_refuse_at_once_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("takes/a/x.mp4", "takes/b/x.mp4", "takes/b/y.mp4", "notes.txt"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("no video")
+    for name, said in ("takes", "two videos are named x; give"), ("notes.txt", "neither a folder of videos"):
+        words = [str(tmp_path / name), "-o", str(tmp_path / "out"), "--dry-run", "--", "--preset", "draft"]
+        assert main(words) == 2
+        (fault,) = capsys.readouterr().err.splitlines()
+        assert fault.startswith(f"kpbatch: {tmp_path / name}: {said}")
+
+
 def test_a_plan_as_json_is_a_line_for_each_job_and_a_sum(
     tmp_path: Path, take: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -374,6 +374,8 @@ def _checked(job: Job, faults: Faults, places: Mapping[str, str] | None = None) 
             faults.add(job.where, fault.removeprefix(f"{job.source}: "))
         source, is_here = "folder", False
     options, wrong = _parsed(source, job.options)
+    if is_here and any(fault.startswith(f"{job.source}: ") for fault in wrong):
+        options, wrong = None, []  # what `_check_source` says of the source
     # The parser names only the first option that it refuses; some are refused only beside others.
     alone = [(place, fault) for word, place in places.items() for fault in _parsed(source, [word])[1]] if wrong else []
     for place, fault in alone or [(_place_of(fault, places) or job.where, fault) for fault in wrong]:
