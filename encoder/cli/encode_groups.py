@@ -172,7 +172,11 @@ def _read_finished(path: Path, options: Options) -> dict[str, Any]:
         kept = json.loads(path.with_suffix(".json").read_text())
         before, now = kept["options"], _fingerprint(options)
         changed = [name for name in now if before[name] != now[name]]
-        fixed = [f"{name} was {before[name]}, is {now[name]}" for name in changed if name not in LENGTH]
+        fixed = [
+            f"{name} was {_shown(name, before[name])}, is {_shown(name, now[name])}"
+            for name in changed
+            if name not in LENGTH
+        ]
         if fixed:
             raise TrainingError(
                 f"{path}: is finished, with other settings ({', '.join(fixed)}), and all groups of a clip have the "
@@ -186,6 +190,11 @@ def _read_finished(path: Path, options: Options) -> dict[str, Any]:
     length = f", and stays as long as it was trained ({_length(before)} before, {_length(now)} now)" if changed else ""
     log(f"{path}: is finished already{length}")
     return found
+
+
+def _shown(name: str, value: str) -> str:
+    """Return a value of a fingerprint as the command line takes it."""
+    return f"{float(value):g}s" if name == "--group" and value != DEFAULT else value
 
 
 def _length(fingerprint: Mapping[str, str]) -> str:

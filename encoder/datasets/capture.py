@@ -369,7 +369,8 @@ def report_missing(file: Path, folder: Path, missing: list[str], total: int) -> 
     if len(missing) == total:
         which = f"{printable(missing[0])} ..." if total > 1 else printable(missing[0])
         them = agreeing(total, "it", "them")
-        raise DatasetError(f"{file}: none of its {counted(total, 'image')} exists ({which}); copy {them} to {folder}")
+        files = counted(total, "video" if is_video(missing[0]) else "image")
+        raise DatasetError(f"{file}: none of its {files} exists ({which}); copy {them} to {folder}")
     if missing:
         words = agreeing(len(missing), "has no image and is", "have no image and are")
         share = f"{len(missing)} of {counted(total, 'frame')}"

@@ -97,19 +97,19 @@ def _write_pages(files: Sequence[str], folder: Path, memory: int | None) -> dict
     files = [file for file, _ in opened]
     site.copy_player(folder)
     elsewhere: dict[str, Path] = {}
-    names = site.distinct_names([Path(urlsplit(file).path if is_url(file) else file).stem for file in files])
+    stems = [Path(urlsplit(file).path if is_url(file) else file).stem for file in files]
     is_gallery = len(files) > 1
     scenes = {}
-    for (file, groups), name in zip(opened, names, strict=True):
+    for (file, groups), stem, name in zip(opened, stems, site.distinct_names(stems), strict=True):
         prefix = f"{name}/" if is_gallery else ""
         address, hosts = f"{name}.kpc", ""
         if is_url(file):
             address, hosts = file, f" {urlsplit(file).scheme}://{urlsplit(file).netloc}"
         else:
             elsewhere[f"/{prefix}{address}"] = Path(file).absolute()
-        scene = SharedScene(
-            address, name, groups.metadata(), groups.clip, groups.reader.header.file_length, has_poster=False
-        )
+        length = groups.reader.header.file_length
+        size = length if groups.reader.source.size is None else min(length, groups.reader.source.size)
+        scene = SharedScene(address, stem, groups.metadata(), groups.clip, size, has_poster=False)
         (folder / prefix).mkdir(exist_ok=True)
         page = site.scene_page(scene, root="../" if is_gallery else "", hosts=hosts, memory=memory)
         site.write_file(folder / prefix / site.PAGE, page)

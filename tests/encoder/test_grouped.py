@@ -303,6 +303,8 @@ def test_finished_groups_may_have_another_length_but_no_other_options(tmp_path, 
         assert err.startswith(f"{path}: is finished already") and err.endswith(said)
     with pytest.raises(TrainingError, match=r"other settings \(--tune-steps was the default, is 5\), and all groups"):
         encode_groups._read_finished(path, replace(before, steps=60, tune_steps=5))
+    with pytest.raises(TrainingError, match=r"\(--group was the default, is 2s\)"):
+        encode_groups._read_finished(path, replace(before, group_s=2.0))
 
 
 @pytest.mark.usefixtures("searched")

@@ -381,6 +381,7 @@ def test_a_folder_is_played_without_what_cannot_be_read(tmp_path: Path, capsys: 
     with serving_pages([str(path) for path in (whole, cut, foreign)], memory=300_000_000) as url:
         addresses = Page(read(url)[0].decode()).addresses()
         assert [address for address in addresses if address.endswith("index.html")] == ["a/index.html", "b/index.html"]
+        assert "30 KB" in read(url)[0].decode()
         assert ("kpc-player", "memory", "300000000") in Page(read(url + "b/")[0].decode()).attributes
         assert len(read(url + "b/b.kpc")[0]) == 30_000
     said = capsys.readouterr().err.splitlines()
@@ -388,6 +389,15 @@ def test_a_folder_is_played_without_what_cannot_be_read(tmp_path: Path, capsys: 
     assert said[1].startswith(f"kpplay: {foreign}: ") and said[1].endswith("; left out")
     with pytest.raises(FormatError), serving_pages([str(foreign)]):
         pass
+
+
+def test_a_gallery_shows_names_of_files_that_addresses_cannot_have(tmp_path: Path) -> None:
+    scenes = [tmp_path / "Größe 1.kpc", tmp_path / "Größe 2.kpc"]
+    for scene in scenes:
+        shutil.copy(SAMPLE, scene)
+    with serving_pages([str(scene) for scene in scenes]) as url:
+        page = read(url)[0].decode()
+        assert "Größe 1.kpc" in page and "Größe 2.kpc" in page
 
 
 def test_a_scene_elsewhere_may_be_loaded_from_there_alone(tmp_path: Path) -> None:

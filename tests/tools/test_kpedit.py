@@ -89,6 +89,10 @@ def test_provenance_comes_from_a_file_and_goes(folder, capsys):
     scaled = edit(folder, "--scale", "2").rename(folder / "scaled.kpc")
     assert kpedit.main([str(scaled), "-o", str(again), "--provenance", str(folder / "made.json")]) == 0
     assert set(read(again).metadata.provenance) == {"history", "preset", "seed"}
+    (folder / "made.json").write_text('{"preset": "fast", "held_out": {"pictures": 3}, "coding_loss_db": 0.1}')
+    measured = edit(folder, "--provenance", str(folder / "made.json"))
+    assert kpedit.main([str(measured), "-o", str(again), "--box", "-0.4,-0.4,-0.4,0.4,0.4,0.4"]) == 0
+    assert set(read(again).metadata.provenance) == {"history", "preset"}  # what was measured is of the whole
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,8 @@ def main(argv: Sequence[str]) -> None:
         WorseError: something is worse.
     """
     parser = cli.Parser(
-        "kpbench compare", description="Print what is better and worse in new records; exit with 1 if anything is."
+        "kpbench compare",
+        description="Print what is better and worse in new records; exit with 1 if anything is worse.",
     )
     for name in ("before", "after"):
         parser.add_argument(name, type=cli.input_path, metavar=f"{name.upper()}.json")

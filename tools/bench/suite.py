@@ -135,9 +135,11 @@ def plan(steps: Iterable[Step], output: Path, work: Path, commit: str) -> str:
     """Return the steps with their expected minutes on two cores and their states, a line each."""
     lines, left = [], 0.0
     for step in steps:
-        state = "done" if is_done(step, output, work, commit) else step.missing() or "to do"
+        reason = step.missing()
+        state = "done" if is_done(step, output, work, commit) else "left out" if reason else "to do"
         left += step.minutes * (state == "to do")
-        lines.append(f"{step.minutes:5.1f} min  {step.name:<18} {state:<8} {shlex.join(step.command)}")
+        why = f"  ({reason})" if state == "left out" else ""
+        lines.append(f"{step.minutes:5.1f} min  {step.name:<18} {state:<8} {shlex.join(step.command)}{why}")
     return "\n".join([*lines, f"{left:5.1f} min  to do on two cores, from commit {short_commit(commit)}"])
 
 

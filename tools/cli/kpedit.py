@@ -252,7 +252,7 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement:
         if (outside := opening_beyond_limits(metadata)) is not None:
             notice(f"kpedit: {outside}; --open-at sets another")
     if options.start is not None or options.end is not None or options.box is not None:
-        metadata = metadata.with_provenance(held_out=None)  # it was measured on the whole
+        metadata = metadata.with_provenance(held_out=None, coding_loss_db=None)  # measured on the whole
     if options.provenance is not None:
         metadata = metadata.with_provenance(**_provenance_for(metadata, options))
     if step := _history(options):
