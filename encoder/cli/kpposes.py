@@ -9,7 +9,6 @@
 
 import argparse
 import json
-import math
 import sys
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from kpc.encoder.datasets.layouts.nerfstudio import NAME as NERFSTUDIO
 from kpc.encoder.datasets.loading import layouts_of
 from kpc.encoder.evaluation.camera_page import check_page
 from kpc.encoder.poses.document import write_document
+from kpc.encoder.poses.facts import camera_table
 from kpc.encoder.poses.find import Found, find_poses
 from kpc.encoder.poses.page import NAME, write_page
 from kpc.encoder.poses.wishes import add_pose_options, wishes_from
@@ -97,26 +97,12 @@ def _say_if_not_read(folder: Path, file: Path) -> None:
 
 
 def report(found: Found) -> str:
-    """Return a table of the cameras: clock, points and error, as text."""
-    if found.kind != "still rig":
+    """Return a table of the cameras, with clock, points and error, or a line about their pictures, as text."""
+    if found.kind in ("moving camera", "photographs"):
         views = found.structure.views.values()
         points = sorted(view.points for view in views)
         return f"{len(views)} pictures, error {found.structure.error:.2f} px, {points[len(points) // 2]} points in each"
-    rows = [("camera", "clock s", "rate", "by", "confidence", "focal px", "points", "error px")]
-    for number, (name, clock) in enumerate(zip(found.view_names, found.clocks, strict=True)):
-        view = found.structure.views.get(number)
-        rows.append(
-            (
-                escaped(name),
-                f"{clock.offset_s:+.4f}",
-                f"{clock.rate:.5f}",
-                clock.method,
-                "" if math.isnan(clock.confidence) else f"{clock.confidence:.0%}",
-                "not placed" if view is None else f"{view.intrinsics[0]:.1f}",
-                "" if view is None else f"{view.points}",
-                "" if view is None else f"{view.error:.2f}",
-            )
-        )
+    rows = [(escaped(name), *facts) for name, *facts in camera_table(found)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows

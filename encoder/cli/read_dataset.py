@@ -12,6 +12,7 @@ from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.sound import check_sound, sound_of_span
 from kpc.encoder.cli.work_folder import POSES
 from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.datasets.layouts.nerfstudio import IMAGES
 from kpc.encoder.datasets.loading import has_layout, layouts_of
 from kpc.encoder.poses.footage import find_footage, videos_by_name
 from kpc.format.common.errors import UsageError
@@ -48,8 +49,8 @@ def read_dataset(options: Options) -> Dataset:
             if (footage := find_footage(root))[0].video is not None:
                 check_sound(options, {one.files[0].relative_to(root).as_posix(): one.files[0] for one in footage})
             _find_poses(options, file, changed)
-        is_own = (file.parent / "images").is_dir()  # the frames of a moving camera lie beside the document
-        root, transforms = (file.parent, None) if is_own else (root, file)
+        is_own = (file.parent / IMAGES).is_dir()  # the frames of moving cameras lie beside the document
+        root, transforms = (file.parent if is_own else root), file
 
     def check(clip: Clip, videos: Mapping[str, Path]) -> None:
         check_target_size(options, clip)
@@ -62,6 +63,7 @@ def read_dataset(options: Options) -> Dataset:
         downscale=options.downscale or 1,
         most_across=options.most_across,
         transforms=transforms,
+        footage=None if transforms is None else options.source,
         check_clip=check,
     )
 

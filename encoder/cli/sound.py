@@ -30,7 +30,7 @@ def find_sound(options: Options, dataset: Dataset) -> tuple[Sound | None, str]:
     wanted = options.audio
     if wanted == "none" or (wanted == "auto" and dataset.video_start_s is None):
         return None, wanted
-    files = _videos(dataset)
+    files = {name: film.file for name, film in dataset.films.items()}
     check_sound(options, files, is_dynamic=dataset.is_dynamic)
     if not dataset.is_dynamic:
         return None, wanted
@@ -83,16 +83,8 @@ def sound_of_span(sound: Sound | None, span: Span, fps: float) -> Sound | None:
     return sound.part(sample_at(span.start, fps), sample_at(span.count, fps))
 
 
-def _videos(dataset: Dataset) -> dict[str, Path]:
-    """Return the videos of a dataset by the names of their files; none of images."""
-    if dataset.video_start_s is None:
-        return {}
-    return {name: dataset.path / name for name in dict.fromkeys(dataset.pictures.file)}
-
-
 def _samples(dataset: Dataset, path: Path, most_s: float = float("inf")) -> np.ndarray | None:
-    name = path.relative_to(dataset.path).as_posix() if path.is_relative_to(dataset.path) else ""
-    offset_s, rate = dataset.clocks.get(name, (0.0, 1.0))
+    offset_s, rate = next((film.clock for film in dataset.films.values() if film.file == path), (0.0, 1.0))
     start_s = ((dataset.video_start_s or 0.0) - offset_s) / rate
     return read_samples(path, start_s, min(dataset.clip.total_s, most_s))
 

@@ -5,8 +5,8 @@ import math
 import os
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +100,19 @@ class CapturedView:
 
 
 @dataclass(frozen=True)
+class Film:
+    """A video whose sound may be that of the clip.
+
+    Attributes:
+        file: the video.
+        clock: seconds to be added to its times after they are multiplied by the second number.
+    """
+
+    file: Path
+    clock: tuple[float, float] = (0.0, 1.0)
+
+
+@dataclass(frozen=True)
 class Capture:
     """A dataset before its pixels are read.
 
@@ -110,6 +123,9 @@ class Capture:
         found: all images, or videos, in the folders that the layout reads.
         left_out: those of them that are not used for a reason that the layout has reported.
         poses_found: whether `kpposes` found the poses.
+        frame_count: of the clip of images with times; None if it follows from these.
+        films: by their names, videos from which images were taken.
+        start_s: when the clip of these begins by the common clock; None if it is unknown.
     """
 
     layout: str
@@ -118,6 +134,9 @@ class Capture:
     found: tuple[Path, ...]
     left_out: tuple[Path, ...] = ()
     poses_found: bool = False
+    frame_count: int | None = None
+    films: Mapping[str, Film] = field(default_factory=dict)
+    start_s: float | None = None
 
 
 def image_view(

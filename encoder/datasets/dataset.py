@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import printable
+from kpc.encoder.datasets.capture import Film, printable
 from kpc.encoder.datasets.masks import Masks
 from kpc.encoder.datasets.pixel_cache import PixelCache
 from kpc.format.common.errors import DatasetError
@@ -78,10 +78,11 @@ class Dataset:
         camera_names: by the numbers in `pictures.camera`.
         masks: which pixels may be used; None if all may.
         left_out: how many images or videos in the folders that were read are not used.
-        video_start_s: when the whole clip begins, in the seconds of the videos; None if the pictures are images.
+        video_start_s: when the whole clip begins, in the seconds of the videos; None without videos.
         downscale: side of the blocks of pixels of the files that were averaged.
         clocks: of videos by their names: the offset and rate that make their times those of the clip.
         poses_found: whether `kpposes` found the poses.
+        films: the videos of the pictures, or from which these were taken, by their names.
     """
 
     layout: str
@@ -98,6 +99,7 @@ class Dataset:
     downscale: int = 1
     clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     poses_found: bool = False
+    films: Mapping[str, Film] = field(default_factory=dict)
 
     @property
     def is_monocular(self) -> bool:

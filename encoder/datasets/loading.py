@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 
 from kpc.encoder.datasets.cache_lock import exclusive
-from kpc.encoder.datasets.capture import Capture, CapturedView, MaskFile, first_names, report_orientations
+from kpc.encoder.datasets.capture import Capture, CapturedView, Film, MaskFile, first_names, report_orientations
 from kpc.encoder.datasets.dataset import Dataset, Pictures
 from kpc.encoder.datasets.decoded_pictures import cached_pixels
 from kpc.encoder.datasets.layouts import (
@@ -29,7 +29,7 @@ from kpc.encoder.datasets.layouts import (
 )
 from kpc.encoder.datasets.left_out import count_left_out
 from kpc.encoder.datasets.masks import find_masks, load_masks
-from kpc.encoder.datasets.timeline import align
+from kpc.encoder.datasets.timeline import align, in_step
 from kpc.encoder.datasets.video import VideoInfo
 from kpc.format.common.errors import DatasetError, MediaError
 from kpc.format.common.text import notice, one_line, valid_unicode
@@ -61,6 +61,7 @@ def load_dataset(
     most_across: int | None = None,
     progress: bool = True,
     transforms: Path | None = None,
+    footage: Path | None = None,
     check_clip: Callable[[Clip, Mapping[str, Path]], object] = lambda *_: None,
 ) -> Dataset:
     """Read a dataset: recognise its layout by its content, decode its pictures and masks, and read its cameras.
@@ -77,6 +78,7 @@ def load_dataset(
         most_across: instead of `downscale`, the most pixels along the longer side of a picture.
         progress: whether to report progress on stderr.
         transforms: a document of `kpposes` for the folder, if it lies elsewhere.
+        footage: the folder of the videos from which its images were taken, if it is another.
         check_clip: called with the clip and its videos by name before pictures are decoded; what it raises ends the
             reading.
 
@@ -87,7 +89,10 @@ def load_dataset(
     """
     root = Path(path)
     try:
-        capture = _recognise(root, holdout) if transforms is None else nerfstudio.read(root, holdout, transforms)
+        if transforms is None:
+            capture = _recognise(root, holdout)
+        else:
+            capture = nerfstudio.read(root, holdout, transforms, footage)
         if most_across is not None:
             downscale = _fitting_downscale(root, capture.views, most_across)
         _check(root, capture, downscale)
@@ -186,7 +191,9 @@ def _load(
 ) -> Dataset:
     views = capture.views
     frames, times, clip, video_start_s = _times(root, capture)
-    check_clip(clip, {view.file.relative_to(root).as_posix(): view.file for view in views if view.video})
+    films = {view.file.relative_to(root).as_posix(): Film(view.file, view.clock) for view in views if view.video}
+    films |= capture.films
+    check_clip(clip, {name: film.file for name, film in films.items()})
     view_of = np.repeat(np.arange(len(views)), [len(some) for some in frames])  # the view of each picture
     used = [(some.start, some.stop) for some in frames]
     key = hashlib.sha256(os.fsencode(f"{root.resolve()} {downscale} {used}")).hexdigest()[:12]
@@ -237,6 +244,7 @@ def _load(
         downscale=downscale,
         clocks={view.file.relative_to(root).as_posix(): view.clock for view in views if view.video},
         poses_found=capture.poses_found,
+        films=films,
     )
 
 
@@ -245,9 +253,10 @@ def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray,
     begins in the seconds of the videos; None for images.
 
     Videos are aligned by `timeline.align`. The time of an image is the dataset's if all are within [0, 1], else shifted
-    and scaled to [0, 1]; the frame count of their clip follows from the median step between times of training images.
+    and scaled to [0, 1]; the frame count of their clip is the dataset's, or follows from the median step between times
+    of training images.
     """
-    videos = {_name(root, capture, view): _in_step(view) for view in capture.views if view.video}
+    videos = {_name(root, capture, view): in_step(view.video, view.clock) for view in capture.views if view.video}
     if videos:
         _report_notes(root, videos)
         timeline = align(root, videos)
@@ -267,18 +276,12 @@ def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray,
     if low < 0 or high > 1:
         notice(f"{root}: times run from {low:g} to {high:g}; scaled to [0, 1]")
         times = (times - low) / (high - low) if high > low else np.zeros_like(times)
+    clip = Clip(capture.frame_count or 1, float(capture.fps or ASSUMED_FPS))
+    if capture.frame_count is not None:
+        return still, times, clip, capture.start_s
     steps = np.diff(np.unique(np.round(times[[not view.is_test for view in capture.views]], 6)))
     count = min(1 + round(1 / float(np.median(steps))), len(times)) if len(steps) else 1
-    return still, times, Clip(count, float(capture.fps or ASSUMED_FPS)), None
-
-
-def _in_step(view: CapturedView) -> VideoInfo:
-    """Return the properties of a view's video with its times by the common clock."""
-    assert view.video is not None
-    offset_s, rate = view.clock
-    return replace(
-        view.video, times=offset_s + rate * view.video.times, tick_s=rate * view.video.tick_s, fps=view.video.fps / rate
-    )
+    return still, times, replace(clip, frame_count=count), None
 
 
 def _name(root: Path, capture: Capture, view: CapturedView) -> str:

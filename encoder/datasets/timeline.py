@@ -6,7 +6,7 @@ that rate has them, since time stamps are rounded.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,20 +48,26 @@ class Timeline:
 
 
 def align(root: Path, videos: Mapping[str, VideoInfo]) -> Timeline:
-    """Align videos by presentation time, and print one line if they do not show the same instants.
+    """Align videos by presentation time; as `align_times`."""
+    rates = [frame_rate(video) for video in videos.values()]
+    seconds = [even_times(video, rate) for video, rate in zip(videos.values(), rates, strict=True)]
+    return align_times(root, list(videos), rates, seconds)
+
+
+def align_times(root: Path, names: Sequence[str], rates: Sequence[float], seconds: Sequence[np.ndarray]) -> Timeline:
+    """Align videos by the times of their frames, and print one line if they do not show the same instants.
 
     The clip spans what all videos show, to within half a frame. Its rate is that of the video of the highest rate.
 
     Args:
         root: the dataset's folder, for messages.
-        videos: by name.
+        names: of the videos.
+        rates: frames per second of each.
+        seconds: of each, the times of its frames, (N,) float64, increasing.
 
     Raises:
         DatasetError: the videos have no time in common.
     """
-    names = list(videos)
-    rates = [frame_rate(video) for video in videos.values()]
-    seconds = [even_times(video, rate) for video, rate in zip(videos.values(), rates, strict=True)]
     fps = max(rates)
     starts, ends = np.array([t[0] for t in seconds]), np.array([t[-1] for t in seconds])
     reach = (SIMULTANEOUS - ON_FRAME) / fps
@@ -84,6 +90,17 @@ def align(root: Path, videos: Mapping[str, VideoInfo]) -> Timeline:
         notice(f"{root}: {line}")
     times = tuple(p / max(last, 1e-9) for p in positions)
     return Timeline(Clip(round(float(last)) + 1, fps), tuple(frames), times, float(start))
+
+
+def in_step(video: VideoInfo, clock: tuple[float, float]) -> VideoInfo:
+    """Return the properties of a video with its times by the common clock.
+
+    Args:
+        video: by its own clock.
+        clock: seconds to be added to its times after they are multiplied by the second number.
+    """
+    offset_s, rate = clock
+    return replace(video, times=offset_s + rate * video.times, tick_s=rate * video.tick_s, fps=video.fps / rate)
 
 
 def frame_rate(video: VideoInfo) -> float:

@@ -70,7 +70,7 @@ def main(folder: Path) -> None:
     found: dict[str, Any] = {"views": {}, "apart": apart}
     arrays: dict[str, Any] = {}
     if model is not None:
-        model = _with_best_cameras(model, job["is_rig"])
+        model = _with_best_cameras(model, job["lenses"])
         found["views"], arrays = _views(model), _points(model)
     found["pairs"] = _pairs(database, model)
     np.savez(folder / "result.npz", **arrays)
@@ -140,7 +140,7 @@ def _alike(job: dict[str, Any], pictures: list[tuple[np.ndarray, np.ndarray]]) -
     for number, (pair, matched) in enumerate(match_pairs(features, candidates, job["threads"]), 1):
         counts[pair] = len(matched)
         _say("comparing", number, len(candidates))
-    return alike_pairs(counts, job["alike"])
+    return alike_pairs(counts, job["alike"], job["groups"])
 
 
 def _starts(job: dict[str, Any], counts: list[int]) -> list[int]:
@@ -300,22 +300,26 @@ def _mean_error(model: pycolmap.Reconstruction) -> float:
     return float(model.compute_mean_reprojection_error())
 
 
-def _with_best_cameras(model: pycolmap.Reconstruction, is_rig: bool) -> pycolmap.Reconstruction:
+def _with_best_cameras(model: pycolmap.Reconstruction, lenses: list[list[int]]) -> pycolmap.Reconstruction:
     """Return the model adjusted with the cameras that its points speak for: how many parameters, shared or not.
 
     If there are many more than COMPARED observations, some of the points choose the cameras, and then all count.
+
+    Args:
+        model: as it was placed.
+        lenses: the number of each view's lens, in each way that is tried, from the fewest lenses on.
     """
-    best, chosen, least = model, (FIRST_MODEL, True), np.inf
+    best, chosen, least = model, (FIRST_MODEL, lenses[0]), np.inf
     every = max(1, round(model.compute_num_observations() / COMPARED))
     _say("adjusting lenses", 0, 1)
-    for shared in (True, False) if is_rig else (True,):
+    for some in lenses:
         for name in MODELS:
-            tried = _with_cameras(model, name, shared, every)
+            tried = _with_cameras(model, name, some, every)
             _adjust(tried)
             measure = _criterion(tried)
             if measure < least:
-                best, chosen, least = tried, (name, shared), measure
-            elif name != MODELS[0] or not shared:
+                best, chosen, least = tried, (name, some), measure
+            elif name != MODELS[0]:
                 break  # more parameters do not help
     if every == 1 or not np.isfinite(least):
         return best
@@ -342,20 +346,22 @@ def _criterion(model: pycolmap.Reconstruction) -> float:
     return float(count * np.log((errors**2).mean()) + EVIDENCE * parameters * np.log(count))
 
 
-def _with_cameras(model: pycolmap.Reconstruction, name: str, shared: bool, every: int = 1) -> pycolmap.Reconstruction:
+def _with_cameras(
+    model: pycolmap.Reconstruction, name: str, lenses: list[int], every: int = 1
+) -> pycolmap.Reconstruction:
     """Return a copy with other camera models, which begin with the focal length found and without distortion.
 
     Args:
         model: what is copied.
         name: of the camera model.
-        shared: whether views that have one camera now keep it; else each gets its own.
+        lenses: the number of each view's lens.
         every: the copy has one of so many points.
     """
     copy = pycolmap.Reconstruction()
     cameras: set[int] = set()
     for number in model.reg_image_ids():
         image = model.images[number]
-        key = image.camera_id if shared else number
+        key = lenses[number - 1] + 1
         if key not in cameras:
             own = model.cameras[image.camera_id]
             camera = pycolmap.Camera.create_from_model_name(key, name, own.mean_focal_length(), own.width, own.height)

@@ -6,32 +6,32 @@ from typing import Any
 
 import numpy as np
 
-from kpc.encoder.datasets.layouts.nerfstudio import MADE_BY
+from kpc.encoder.datasets.layouts.nerfstudio import IMAGES, MADE_BY
 from kpc.encoder.datasets.video import read_video
+from kpc.encoder.poses.clocks import Clock
 from kpc.encoder.poses.find import Found, depth_range
+from kpc.encoder.poses.footage import Footage
 from kpc.encoder.poses.instants import frame_times
 from kpc.encoder.poses.structure import PlacedView
+from kpc.encoder.poses.takes import Take
 from kpc.format.common import cli
 from kpc.format.common.images import write_image
 from kpc.format.common.progress import progress
 
-# The folder beside the document that holds the frames of a moving camera.
-IMAGES = "images"
-
 
 def write_document(found: Found, root: Path, file: Path) -> None:
-    """Write the document, and beside it the frames of a moving camera as images.
+    """Write the document, and beside it the frames of moving cameras as images.
 
     Args:
         found: cameras and clocks.
-        root: the folder that names are relative to, but for the frames of a moving camera.
+        root: the folder that names are relative to, but for the frames of the videos of moving cameras.
         file: of the document.
     """
     document: dict[str, Any] = {"camera_model": "OPENCV", "made_by": MADE_BY, "kind": found.kind}
     if found.is_metric:
         document["unit"] = "metre"
-    if found.kind == "moving camera":
-        document |= _moving_camera(found, root, file.parent)
+    if found.take is not None:
+        document |= _moving_cameras(found, found.take, root, file.parent)
     else:
         document["frames"] = [
             frame for number in sorted(found.structure.views) for frame in _frames_of(found, number, root)
@@ -50,29 +50,48 @@ def _frames_of(found: Found, number: int, root: Path) -> list[dict[str, Any]]:
             {"file_path": _relative(image, root)} | ({"time": float(time)} if len(footage.files) > 1 else {}) | camera
             for image, time in zip(footage.files, times, strict=True)
         ]
-    clocks = {"time_offset": clock.offset_s} if clock.offset_s else {}
-    if clock.rate != 1:
-        clocks["time_rate"] = clock.rate
     size = {"w": footage.video.width, "h": footage.video.height}
-    return [{"file_path": _relative(footage.files[0], root)} | clocks | size | camera]
+    return [{"file_path": _relative(footage.files[0], root)} | _clock(clock) | size | camera]
 
 
-def _moving_camera(found: Found, root: Path, folder: Path) -> dict[str, Any]:
-    """Return the frames of a moving camera: its images, or those of its video, which are written into a folder."""
-    footage, views = found.footage[0], sorted(found.structure.views)
-    times = frame_times(footage) - frame_times(footage)[0]
-    files = {number: _relative(footage.files[number], root) for number in views} if footage.video is None else {}
-    fps = {} if footage.video is None else {"fps": float(footage.video.fps)}
-    if footage.video is not None:
-        (folder / IMAGES).mkdir(parents=True, exist_ok=True)
-        pictures = enumerate(read_video(footage.files[0], footage.video))
-        for number, picture in progress(pictures, "writing frames", len(times), "frame"):
-            if number in found.structure.views:
-                files[number] = f"{IMAGES}/{found.view_names[number]}.png"
-                write_image(folder / files[number], picture)
-    last = max(float(times[-1]), 1e-9)
-    frames = [{"file_path": files[n], "time": float(times[n]) / last} | _camera(found, n) for n in views]
-    return fps | {"frames": frames}
+def _clock(clock: Clock) -> dict[str, float]:
+    offset = {"time_offset": clock.offset_s} if clock.offset_s else {}
+    return offset | ({"time_rate": clock.rate} if clock.rate != 1 else {})
+
+
+def _moving_cameras(found: Found, take: Take, root: Path, folder: Path) -> dict[str, Any]:
+    """Return the clip and the frames of moving cameras: images, or those of videos, which are written into a folder."""
+    document: dict[str, Any] = {"frame_count": take.frame_count, "frames": []}
+    if take.fps is not None and take.start_s is not None:
+        document |= {"fps": take.fps, "start_s": take.start_s}
+        document["videos"] = [
+            {"file_path": _relative(one.files[0], root)} | _clock(clock)
+            for one, clock in zip(found.footage, found.clocks, strict=True)
+        ]
+    for footage, track in zip(found.footage, take.tracks, strict=True):
+        placed = {frame for frame in track.frames if track.view_of(frame) in found.structure.views}
+        files = {frame: _relative(footage.files[frame], root) for frame in placed} if footage.video is None else {}
+        if footage.video is not None and placed:
+            names = {frame: f"{IMAGES}/{name}.png" for frame, name in zip(track.frames, track.frame_names, strict=True)}
+            files = {frame: names[frame] for frame in placed}
+            _write_frames(footage, track.frames, {frame: folder / file for frame, file in files.items()})
+        cameras = {view: _camera(found, view) for view in track.views if view in found.structure.views}
+        document["frames"] += [
+            {"file_path": files[frame], "time": float(time)} | cameras[track.view_of(frame)]
+            for frame, time in zip(track.frames, track.times, strict=True)
+            if frame in placed
+        ]
+    return document
+
+
+def _write_frames(footage: Footage, frames: range, files: dict[int, Path]) -> None:
+    """Write some of the frames of a video into files, by their numbers; those have none that are not wanted."""
+    assert footage.video is not None
+    next(iter(files.values())).parent.mkdir(parents=True, exist_ok=True)
+    pictures = zip(frames, read_video(footage.files[0], footage.video, frames.start, frames.stop), strict=True)
+    for frame, picture in progress(pictures, f"writing frames of {footage.name}", len(frames), "frame"):
+        if frame in files:
+            write_image(files[frame], picture)
 
 
 def _relative(file: Path, root: Path) -> str:

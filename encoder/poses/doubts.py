@@ -1,6 +1,7 @@
 """Reasons to doubt a model in spite of small errors: patterns that repeat themselves, few points, impossible places."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -33,18 +34,18 @@ def doubts(kind: str, names: Sequence[str], structure: Structure) -> list[str]:
         structure: the model.
     """
     found = []
-    shares = confirmed_shares(structure)
-    doubtful = [f"{names[view]} ({share:.0%})" for view, share in shares.items() if share < CONFIRMED]
+    shares = {view: share for view, share in confirmed_shares(structure).items() if share < CONFIRMED}
+    doubtful = [f"{names[view]} ({share:.0%})" for view, share in shares.items()]
+    apart = [names[view] for view in structure.apart]
+    if kind == "moving cameras":
+        doubtful, apart = by_camera(names, shares), by_camera(names, structure.apart)
     if doubtful:
         found.append(
             f"matches of {first_names(doubtful)} contradict where these were placed: patterns that repeat themselves, "
             "such as tiles or windows, may have been mistaken for each other; film with something unlike beside them"
         )
-    if structure.apart:
-        found.append(
-            f"{first_names([names[view] for view in structure.apart])} fit each other but not the rest; film what "
-            "connects them"
-        )
+    if apart:
+        found.append(f"{first_names(apart)} fit each other but not the rest; film what connects them")
     points = sorted(view.points for view in structure.views.values())
     if points[len(points) // 2] < FEW_POINTS:
         found.append(
@@ -53,8 +54,9 @@ def doubts(kind: str, names: Sequence[str], structure: Structure) -> list[str]:
         )
     if kind == "still rig":
         found += [f"{names[one]} and {names[two]} were placed at one point" for one, two in _at_one_place(structure)]
-    if kind == "moving camera":
-        jumps = [f"{names[one]} and {names[two]}" for one, two in _jumps(structure)]
+    if kind in ("moving camera", "moving cameras"):
+        cameras = [_camera(name) if kind == "moving cameras" else "" for name in names]
+        jumps = [f"{names[one]} and {names[two]}" for one, two in _jumps(cameras, structure)]
         if jumps:
             found.append(
                 f"the path jumps between {first_names(jumps)}: the clip is cut there, or its frames were placed wrongly"
@@ -82,14 +84,38 @@ def _at_one_place(structure: Structure) -> list[tuple[int, int]]:
     return [(numbers[i], numbers[j]) for i, j in np.argwhere(np.triu(apart < least, 1)).tolist()]
 
 
-def _jumps(structure: Structure) -> list[tuple[int, int]]:
-    """Return frames between which the camera moves much further than around them."""
-    numbers = np.array(sorted(structure.views))
-    poses = np.stack([structure.views[int(number)].camera_to_world for number in numbers])
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / np.diff(numbers)
+def by_camera(names: Sequence[str], views: Iterable[int]) -> list[str]:
+    """Describe some of the views of several cameras that move, each camera once.
+
+    Args:
+        names: of all views, such as "cam00/000012"; that of a camera that stands still among them is its own.
+        views: numbers of some.
+    """
+    counts, totals = Counter(_camera(names[view]) for view in views), Counter(map(_camera, names))
+    said = []
+    for camera, count in counts.items():
+        share = f"all {count}" if count == totals[camera] else f"{count} of {totals[camera]}"
+        said.append(camera if camera in names else f"{share} pictures of {camera}")
+    return said
+
+
+def _camera(name: str) -> str:
+    """Return the name of a view's camera by that of the view."""
+    return name.rpartition("/")[0] or name
+
+
+def _jumps(cameras: Sequence[str], structure: Structure) -> list[tuple[int, int]]:
+    """Return frames between which a camera moves much further than around them; `cameras` are those of all views."""
+    paths: dict[str, list[int]] = {}
+    for number in sorted(structure.views):
+        paths.setdefault(cameras[number], []).append(number)
+    size = extent(np.stack([view.camera_to_world for view in structure.views.values()]))
     found = []
-    for k in np.flatnonzero(steps > JUMP_EXTENT * extent(poses)).tolist():
-        around = np.delete(steps[max(k - AROUND, 0) : k + AROUND + 1], min(k, AROUND))
-        if len(around) >= 4 and steps[k] > JUMP * float(np.median(around)):
-            found.append((int(numbers[k]), int(numbers[k + 1])))
+    for numbers in paths.values():
+        centres = np.stack([structure.views[number].camera_to_world[:3, 3] for number in numbers])
+        steps = np.linalg.norm(np.diff(centres, axis=0), axis=1) / np.diff(numbers)
+        for k in np.flatnonzero(steps > JUMP_EXTENT * size).tolist():
+            around = np.delete(steps[max(k - AROUND, 0) : k + AROUND + 1], min(k, AROUND))
+            if len(around) >= 4 and steps[k] > JUMP * float(np.median(around)):
+                found.append((numbers[k], numbers[k + 1]))
     return found

@@ -9,14 +9,15 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.poses.clocks import UNKNOWN, Clock
-from kpc.encoder.poses.doubts import MATCHED, doubts
-from kpc.encoder.poses.footage import Footage, find_footage
+from kpc.encoder.poses.doubts import MATCHED, by_camera, doubts
+from kpc.encoder.poses.footage import Footage, find_footage, frame_size
 from kpc.encoder.poses.given_clocks import read_clocks
 from kpc.encoder.poses.instants import Picture, grey_of, moving_pictures, still_pictures
 from kpc.encoder.poses.orientation import extent
 from kpc.encoder.poses.structure import MANY, Pairing, PlacedView, Structure, oriented, reconstruct
-from kpc.encoder.poses.survey import Survey, frame_count, greys, survey
+from kpc.encoder.poses.survey import Survey, frame_count, survey
 from kpc.encoder.poses.sync import SURE, clocks_by_motion, clocks_by_sound, wants_motion
+from kpc.encoder.poses.takes import Take, frame_names, pairing_of, pictures_of, take_of
 from kpc.encoder.poses.wishes import Wishes
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info, read_image
@@ -29,10 +30,10 @@ ATTEMPTS = ((4096, 4), (8192, 10))
 FEATURES_OF_MANY = 2048
 # Features in each picture of a moving camera of more than LONG, which sees each point in many of them.
 LONG, FEATURES_OF_LONG = 200, 1024
-# Pictures of one moving camera are matched with those so many frames away, and with some that look alike.
-FRAMES = Pairing((1, 2, 4, 8, 16, 32), alike=5, every=3)
 # Photographs are matched with those that look alike, and with the next ones, which mostly were taken there, too.
 PHOTOGRAPHS = Pairing((1, 2), alike=20)
+# What to do where clocks are unknown.
+CLAP = "film a clap that all cameras see and hear, or give their offsets with --sync offsets.json"
 # A scene cannot be made from fewer cameras.
 LEAST_CAMERAS = 3
 
@@ -42,13 +43,14 @@ class Found:
     """What was found.
 
     Attributes:
-        kind: what the footage was taken for: "still rig", "moving camera" or "photographs".
+        kind: what the footage was taken for: "still rig", "moving camera", "moving cameras" or "photographs".
         footage: of each camera; of each photograph in a collection.
         clocks: of each camera.
-        view_names: of the views: cameras, or pictures of a moving one.
+        view_names: of the views: cameras, or pictures of moving ones.
         structure: z up; the rig's extent is 1 unless `is_metric`.
         is_metric: whether the unit is the metre.
         motion: of each camera of a still rig, how much moves before each frame.
+        take: of one or several cameras that move, which views are theirs; None for others.
     """
 
     kind: str
@@ -58,6 +60,7 @@ class Found:
     structure: Structure
     is_metric: bool
     motion: tuple[np.ndarray, ...] = ()
+    take: Take | None = None
 
 
 def find_poses(root: Path, wishes: Wishes) -> Found:
@@ -68,32 +71,27 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
         MediaError: a file cannot be read.
     """
     footage = find_footage(root)
+    counts = [frame_count(one) for one in footage]
+    if max(counts) == 1 and footage[0].video is not None:
+        raise DatasetError(f"{root}: its videos have one frame each; give whole videos, or photographs as images")
+    if max(counts) == 1 and wishes.rig == "moving":
+        footage = (Footage(root.name, tuple(file for one in footage for file in one.files), None),)
+        counts = [len(counts)]
     _check_distance(root, footage, wishes)
-    images = [one.files[0] for one in footage if frame_count(one) == 1]
-    if len(images) == len(footage) and wishes.rig == "moving":
-        notice(f"{root}: taken for the frames of a camera that moves (as --rig says)")
-        found = _find_moving_camera(
-            root, Footage(root.name, tuple(file for one in footage for file in one.files), None)
-        )
-    elif all(frame_count(one) == 1 for one in footage):
+    if max(counts) == 1:
         frames = "; --rig moving for the frames of a clip" if _is_numbered(footage) else ""
         notice(f"{root}: taken for photographs of one scene ({counted(len(footage), 'image')}{frames})")
         found = _find_photographs(root, footage)
     else:
-        given = read_clocks(wishes.sync, [one.name for one in footage]) if isinstance(wishes.sync, Path) else None
-        surveys = [survey(one) for one in progress(footage, "looking at what moves", unit="camera")]
-        moving = [one.name for one, seen in zip(footage, surveys, strict=True) if not seen.is_still]
-        is_still = not moving if wishes.rig == "auto" else wishes.rig == "still"
+        sync = read_clocks(wishes.sync, [one.name for one in footage]) if isinstance(wishes.sync, Path) else wishes.sync
+        looked = [] if wishes.rig == "moving" else footage
+        surveys = [survey(one) for one in progress(looked, "looking at what moves", unit="camera")]
+        is_still = all(seen.is_still for seen in surveys) if wishes.rig == "auto" else wishes.rig == "still"
         notice(f"{root}: {_what(footage, surveys, is_still, wishes.rig)}")
         if is_still:
-            found = _find_still_rig(root, footage, surveys, given or str(wishes.sync))
-        elif len(footage) == 1:
-            found = _find_moving_camera(root, footage[0])
+            found = _find_still_rig(root, footage, surveys, sync)
         else:
-            raise DatasetError(
-                f"{root}: several cameras that move ({first_names(moving)}) are not supported yet; give one video, or "
-                "--rig still if they do not move"
-            )
+            found = _find_moving_cameras(root, footage, surveys, sync, wishes)
     _check(root, found, wishes.require_all)
     for doubt in doubts(found.kind, found.view_names, found.structure):
         notice(f"{root}: warning: {doubt}")
@@ -112,25 +110,35 @@ def _what(footage: Sequence[Footage], surveys: Sequence[Survey], is_still: bool,
     if is_still:
         stand = agreeing(len(footage), "stands", "stand")
         return f"taken for a rig of {counted(len(footage), 'camera')} that {stand} still ({why})"
-    return f"taken for {'a camera that moves' if len(footage) == 1 else 'cameras that move'} ({why})"
+    if len(footage) == 1:
+        return f"taken for a camera that moves ({why})"
+    still = [one.name for one, seen in zip(footage, surveys, strict=False) if seen.is_still]
+    beside = ""
+    if still:
+        beside = f" and {len(still)} that {agreeing(len(still), 'stands', 'stand')} still, {first_names(still)}"
+        why += "; --rig still if all do, --rig moving if none does"
+    move = len(footage) - len(still)
+    return f"taken for {counted(move, 'camera')} that {agreeing(move, 'moves', 'move')}{beside} ({why})"
 
 
 def _check_distance(root: Path, footage: Sequence[Footage], wishes: Wishes) -> None:
-    """Refuse a distance between views that are not there, before they are placed."""
+    """Refuse a distance between views that are not there, as far as is known before videos are read."""
     if wishes.distance is None:
         return
-    counts = [frame_count(one) for one in footage]
-    is_one = len(footage) == 1 or (wishes.rig == "moving" and max(counts) == 1)
-    names = _frame_names(sum(counts)) if is_one else [one.name for one in footage]
+    names = [one.name for one in footage] if len(footage) > 1 else []
+    if not names or (wishes.rig != "still" and max(frame_count(one) for one in footage) > 1):
+        for one in footage:
+            names += frame_names(one.name if len(footage) > 1 else "", range(frame_count(one)))
+    _check_view_names(root, wishes, names)
+
+
+def _check_view_names(root: Path, wishes: Wishes, names: Sequence[str]) -> None:
+    if wishes.distance is None:
+        return
     unknown = [name for name in wishes.distance[:2] if name not in names]
     if unknown:
         is_or_are = agreeing(len(unknown), "is not there", "are not there")
         raise DatasetError(f"{root}: --distance: {', '.join(unknown)} {is_or_are}; there are {first_names(names)}")
-
-
-def _frame_names(count: int) -> list[str]:
-    """Return the names of the views of a camera that moves."""
-    return [f"{number:06d}" for number in range(count)]
 
 
 def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Survey], sync: str | list[Clock]) -> Found:
@@ -141,12 +149,13 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
             f"needs {LEAST_CAMERAS} or more; film with more cameras, or walk around with one"
         )
     names = [one.name for one in footage]
-    lenses = _lenses([seen.median.shape for seen in surveys])
+    # Views of one size may differ in their lenses.
+    ways = (_lenses([seen.median.shape for seen in surveys]), list(range(len(footage))))
     still: Structure | None = None
     if isinstance(sync, str):
         clocks = clocks_by_sound(footage, sync)
         if wants_motion(footage, clocks, sync):
-            still = reconstruct(still_pictures(surveys), names, lenses, ATTEMPTS[0][0])
+            still = reconstruct(still_pictures(surveys), names, ways[0], ATTEMPTS[0][0], lenses=ways)
             clocks = clocks_by_motion(footage, surveys, clocks, still.views)
         _warn_of_clocks(root, names, clocks)
     else:
@@ -154,7 +163,8 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
     best: Structure | None = None
     for features, instants in ATTEMPTS:
         pictures = [*still_pictures(surveys), *moving_pictures(footage, surveys, clocks, instants)]
-        structure = reconstruct(sorted(pictures, key=lambda picture: picture.view), names, lenses, features)
+        pictures.sort(key=lambda picture: picture.view)
+        structure = reconstruct(pictures, names, ways[0], features, lenses=ways)
         if best is None or (len(structure.views), -structure.error) > (len(best.views), -best.error):
             best = structure
         if len(best.views) == len(footage):
@@ -167,14 +177,14 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
     return Found("still rig", footage, tuple(clocks), tuple(names), best, False, motion)
 
 
-def _warn_of_clocks(root: Path, names: Sequence[str], clocks: Sequence[Clock]) -> None:
-    """Name the cameras whose clocks could not be found, if others' could, and those that are unsure."""
-    advice = "film a clap that all cameras see and hear, or give their offsets with --sync offsets.json"
+def _warn_of_clocks(root: Path, names: Sequence[str], clocks: Sequence[Clock], *, are_moving: bool = False) -> None:
+    """Name the cameras whose clocks could not be found, if others' could or cameras move, and those that are unsure."""
     unknown = [name for name, clock in zip(names, clocks, strict=True) if clock.method == "none"]
-    if unknown and len(unknown) < len(names):
+    why = " by sound, and what moves says nothing of them while cameras move; they" if are_moving else " and"
+    if unknown and (are_moving or len(unknown) < len(names)):
         notice(
-            f"{root}: warning: the clocks of {first_names(unknown)} could not be found and are left as they are; "
-            f"{advice}"
+            f"{root}: warning: the clocks of {first_names(unknown)} could not be found{why} are left as they are; "
+            f"{CLAP}"
         )
     unsure = [
         f"{name} ({clock.confidence:.0%})"
@@ -182,16 +192,51 @@ def _warn_of_clocks(root: Path, names: Sequence[str], clocks: Sequence[Clock]) -
         if clock.method == "motion" and clock.confidence < SURE
     ]
     if unsure:
-        notice(f"{root}: warning: the clocks of {first_names(unsure)} are unsure; {advice}")
+        notice(f"{root}: warning: the clocks of {first_names(unsure)} are unsure; {CLAP}")
 
 
-def _find_moving_camera(root: Path, footage: Footage) -> Found:
-    count = frame_count(footage)
-    names = _frame_names(count)
-    pictures = (Picture(number, 0, grey.round().astype(np.uint8), None) for number, grey in enumerate(greys(footage)))
+def _find_moving_cameras(
+    root: Path, footage: tuple[Footage, ...], surveys: Sequence[Survey], sync: str | list[Clock], wishes: Wishes
+) -> Found:
+    """Place each frame of one or several cameras that move; their clocks are given, or found by sound.
+
+    Args:
+        root: the folder, for messages.
+        footage: of each camera.
+        surveys: of each, where some may stand still; else none.
+        sync: one of `wishes.SYNC_MODES`, or the clocks.
+        wishes: for the names of views.
+    """
+    names, are_videos = [one.name for one in footage], footage[0].video is not None
+    if single := next((one.files[0].name for one in footage if frame_count(one) == 1), None):
+        raise DatasetError(
+            f"{root}: {single} has one frame, beside cameras that move; remove it, or give a whole video"
+        )
+    if sync == "motion" and len(footage) > 1:
+        raise DatasetError(
+            f"{root}: --sync motion: what moves in pictures says nothing of clocks while cameras move; {CLAP}"
+        )
+    clocks = clocks_by_sound(footage, sync) if isinstance(sync, str) else sync
+    if sync in ("auto", "audio") and are_videos and len(footage) > 1:
+        _warn_of_clocks(root, names, clocks, are_moving=True)
+        known = [clock.method != "none" for clock in clocks]
+    else:
+        known = [True] * len(footage)
+    take = take_of(root, footage, clocks, [seen.is_still for seen in surveys] or [False] * len(footage))
+    _check_view_names(root, wishes, take.names)
+    count = len(take.names)
     features = FEATURES_OF_LONG if count > LONG else FEATURES_OF_MANY if count > MANY else ATTEMPTS[0][0]
-    structure = reconstruct(pictures, names, [0] * count, features, FRAMES)
-    return Found("moving camera", (footage,), (UNKNOWN,), tuple(names), structure, False)
+    by_size = _lenses([frame_size(one) for one in footage])
+    structure = reconstruct(
+        pictures_of(footage, surveys, take),
+        take.names,
+        take.cameras,
+        features,
+        pairing_of(take, known),
+        ([by_size[camera] for camera in take.cameras], take.cameras) if len(footage) > 1 else (),
+    )
+    kind = "moving cameras" if len(footage) > 1 else "moving camera"
+    return Found(kind, footage, tuple(clocks), take.names, structure, False, take=take)
 
 
 def _find_photographs(root: Path, footage: tuple[Footage, ...]) -> Found:
@@ -218,13 +263,7 @@ def _check(root: Path, found: Found, require_all: bool) -> None:
     missing = [number for number in range(len(names)) if number not in structure.views]
     if not missing:
         return
-    matched = {number: _neighbours(structure, number) for number in missing}
-    said = [
-        f"{names[number]} ("
-        + (f"matches only {first_names([names[n] for n in near])}" if near else "matches none")
-        + ")"
-        for number, near in matched.items()
-    ]
+    said = by_camera(names, missing) if found.kind == "moving cameras" else _with_neighbours(found, missing)
     noun = "cameras" if found.kind == "still rig" else "pictures"
     placed = f"{len(structure.views)} of {len(names)} {noun} could be placed"
     advice = "film with more overlap, more texture and sharper pictures"
@@ -233,6 +272,15 @@ def _check(root: Path, found: Found, require_all: bool) -> None:
     if require_all:
         raise DatasetError(f"{root}: {placed}; left out: {first_names(said)}; {advice}, or drop --require-all")
     notice(f"{root}: {placed}; left out: {first_names(said)}")
+
+
+def _with_neighbours(found: Found, missing: Sequence[int]) -> list[str]:
+    """Return the names of views that could not be placed, each with those that it matches."""
+    said = []
+    for number in missing:
+        near = [found.view_names[n] for n in _neighbours(found.structure, number)]
+        said.append(f"{found.view_names[number]} ({f'matches only {first_names(near)}' if near else 'matches none'})")
+    return said
 
 
 def _neighbours(structure: Structure, number: int) -> list[int]:

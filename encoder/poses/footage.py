@@ -7,6 +7,7 @@ from kpc.encoder.datasets.capture import natural_key
 from kpc.encoder.datasets.left_out import media_in
 from kpc.encoder.datasets.video import VideoInfo, video_info
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.images import image_info
 from kpc.format.common.media_files import is_hidden, is_image, is_video
 
 # Folders of frames have at least as many images; fewer are photographs.
@@ -47,6 +48,13 @@ def find_footage(root: Path) -> tuple[Footage, ...]:
             f"{root}: holds no videos, folders of frames, or three photographs; give a video for each camera"
         )
     return tuple(Footage(file.stem, (file,), None) for file in sorted(images, key=lambda file: natural_key(file.name)))
+
+
+def frame_size(footage: Footage) -> tuple[int, int]:
+    """Return the width and height of a camera's pictures as they are shown, pixels."""
+    if footage.video is not None:
+        return footage.video.width, footage.video.height
+    return image_info(footage.files[0]).displayed_size
 
 
 def videos_by_name(root: Path) -> dict[str, Path]:

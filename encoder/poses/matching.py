@@ -62,18 +62,22 @@ def strongest(keypoints: np.ndarray, descriptors: np.ndarray) -> np.ndarray:
     return descriptors[np.argsort(-sizes, kind="stable")[:STRONGEST]]
 
 
-def alike_pairs(counts: dict[tuple[int, int], int], wanted: int) -> list[tuple[int, int]]:
+def alike_pairs(
+    counts: dict[tuple[int, int], int], wanted: int, groups: Sequence[int] | None = None
+) -> list[tuple[int, int]]:
     """Choose for each picture those that look most like it, by how many of their strongest features match.
 
     As in Wu, "Towards linear-time incremental structure from motion", 3DV 2013, section 3.
 
     Args:
         counts: matches of pairs of pictures.
-        wanted: pictures for each one, at most.
+        wanted: pictures for each one, at most, in each group.
+        groups: of each picture; None if there is one group.
     """
-    partners: dict[int, list[tuple[int, tuple[int, int]]]] = {}
+    partners: dict[tuple[int, int], list[tuple[int, tuple[int, int]]]] = {}
     for pair, count in counts.items():
         if count >= LEAST_ALIKE:
-            for picture in pair:
-                partners.setdefault(picture, []).append((-count, pair))
+            for picture, other in (pair, pair[::-1]):
+                group = 0 if groups is None else groups[other]
+                partners.setdefault((picture, group), []).append((-count, pair))
     return sorted({pair for found in partners.values() for _, pair in sorted(found)[:wanted]})

@@ -36,11 +36,15 @@ class Pairing:
         steps: those whose views' numbers differ by one of these; None for all pictures of an instant.
         alike: besides, so many others for each picture: those that look most like it.
         every: these are sought among pictures so many apart.
+        by_camera: whether steps lead to views of the same camera only, and so many alike are sought in each camera.
+        besides: pairs of views that are matched, too, the first one of the lower number.
     """
 
     steps: tuple[int, ...] | None = None
     alike: int = 0
     every: int = 1
+    by_camera: bool = False
+    besides: tuple[tuple[int, int], ...] = ()
 
 
 ALL = Pairing()
@@ -109,15 +113,18 @@ def reconstruct(
     cameras: Sequence[int],
     features: int,
     pairing: Pairing = ALL,
+    lenses: Sequence[Sequence[int]] = (),
 ) -> Structure:
     """Find cameras and points.
 
     Args:
         pictures: of all views.
         names: of the views.
-        cameras: the number of each view's camera; views of one camera share its lens.
+        cameras: the number of each view's camera; views of one camera share its lens, to begin with.
         features: at most, in each picture.
         pairing: which pictures are matched.
+        lenses: numbers of the views' lenses, in each way that may be chosen for them in the end, from the fewest
+            lenses on; those of `cameras` if there is none.
 
     Raises:
         DatasetError: COLMAP is not installed, or it failed.
@@ -144,7 +151,7 @@ def reconstruct(
             )
         job = {
             "seed": SEED,
-            "is_rig": pairing.steps is None,  # views of one size may differ in their lenses
+            "lenses": [list(some) for some in lenses or (cameras,)],
             "features": features,
             "tracks": TRACKS if len(names) > MANY else None,
             "threads": os.cpu_count() or 1,
@@ -152,9 +159,10 @@ def reconstruct(
             "views": [{"name": name, "camera": camera} for name, camera in zip(names, cameras, strict=True)],
             "cameras": [{"size": sizes[number]} for number in sorted(sizes)],
             "first_octave": 0 if len(described) > MANY and largest > FINE_SIDE else -1,
-            "pairs": _pairs(described, pairing.steps),
-            "compared": list(range(0, len(described), pairing.every)) if pairing.alike else [],
+            "pairs": _pairs(described, pairing, cameras),
+            "compared": _compared(described, pairing, cameras),
             "alike": pairing.alike,
+            "groups": [cameras[picture["view"]] if pairing.by_camera else 0 for picture in described],
         }
         (folder / "job.json").write_text(json.dumps(job))
         _run_worker(folder)
@@ -174,15 +182,31 @@ def _write_grey(file: Path, grey: np.ndarray) -> None:
     file.write_bytes(b"P5 %d %d 255\n" % (grey.shape[1], grey.shape[0]) + grey.tobytes())
 
 
-def _pairs(pictures: list[dict], steps: tuple[int, ...] | None) -> list[tuple[int, int]]:
+def _pairs(pictures: list[dict], pairing: Pairing, cameras: Sequence[int]) -> list[tuple[int, int]]:
     """Return the pairs of pictures to be matched: those of one instant, or also of views so many apart."""
-    found = []
+    steps, besides, found = pairing.steps, set(pairing.besides), []
     for a, one in enumerate(pictures):
         for b in range(a + 1, len(pictures)):
             two = pictures[b]
-            near = steps is None or abs(two["view"] - one["view"]) in steps
-            if one["instant"] == two["instant"] and one["view"] != two["view"] and near:
-                found.append((a, b) if one["view"] < two["view"] else (b, a))
+            first, second = sorted((one["view"], two["view"]))
+            near = steps is None or second - first in steps
+            near &= not pairing.by_camera or cameras[first] == cameras[second]
+            if one["instant"] == two["instant"] and first != second and (near or (first, second) in besides):
+                found.append((a, b) if one["view"] == first else (b, a))
+    return found
+
+
+def _compared(pictures: list[dict], pairing: Pairing, cameras: Sequence[int]) -> list[int]:
+    """Return the pictures among which others that look alike are sought: so many apart, in each camera by itself."""
+    if not pairing.alike:
+        return []
+    counts: dict[int, int] = {}
+    found = []
+    for number, picture in enumerate(pictures):
+        group = cameras[picture["view"]] if pairing.by_camera else 0
+        counts[group] = counts.get(group, -1) + 1
+        if counts[group] % pairing.every == 0:
+            found.append(number)
     return found
 
 

@@ -50,12 +50,13 @@ class Survey:
         return not self.still_share < STILL_SHARE
 
 
-def greys(footage: Footage) -> Iterator[np.ndarray]:
-    """Yield the frames as (H, W) float32 luma in [0, 255]."""
+def greys(footage: Footage, numbers: range | None = None) -> Iterator[np.ndarray]:
+    """Yield the frames as (H, W) float32 luma in [0, 255]: all, or those of consecutive numbers."""
+    numbers = range(frame_count(footage)) if numbers is None else numbers
     frames = (
-        read_video(footage.files[0], footage.video)
+        read_video(footage.files[0], footage.video, numbers.start, numbers.stop)
         if footage.video is not None
-        else (read_image(file, upright=True) for file in footage.files)
+        else (read_image(file, upright=True) for file in footage.files[numbers.start : numbers.stop])
     )
     yield from map(luma, frames)
 

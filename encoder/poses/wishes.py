@@ -18,7 +18,8 @@ class Wishes:
     Attributes:
         rig: one of RIGS: whether cameras move.
         sync: one of SYNC_MODES: how videos are brought in step; or a file of offsets (`given_clocks`).
-        distance: two cameras' names, and how far apart they are in metres; None if unknown.
+        distance: names of two cameras, or of two pictures of moving ones, and how far apart they are in metres; None
+            if unknown.
         require_all: whether to refuse if a camera cannot be placed.
     """
 
@@ -58,9 +59,10 @@ def add_pose_options(parser: argparse.ArgumentParser) -> None:
         "--distance",
         type=_distance,
         metavar="A,B=METRES",
-        help="how far two cameras are apart; without it, the largest distance between cameras is 1",
+        help="how far two cameras, or pictures of moving ones (left/000012), are apart; without it, the largest "
+        "distance between cameras is 1",
     )
-    group.add_argument("--require-all", action="store_true", help="fail if a camera cannot be placed")
+    group.add_argument("--require-all", action="store_true", help="fail if a camera or picture cannot be placed")
 
 
 def wishes_from(given: argparse.Namespace) -> Wishes:

@@ -13,7 +13,7 @@ from kpc.encoder.datasets import load_dataset
 from kpc.encoder.evaluation.camera_page import write_camera_page
 from kpc.encoder.poses.footage import find_footage
 from kpc.format.common.errors import DatasetError
-from textured_room import FOCAL, FPS, SIZE, rig, write_films, write_pictures
+from textured_room import FOCAL, FPS, SIZE, aligned, rig, write_films, write_pictures
 from videos import film
 
 pytest.importorskip("pycolmap", reason="needs pycolmap, of the extra poses")
@@ -46,17 +46,6 @@ def document(room: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
         assert kpposes.main([str(room), "-o", str(file), "--distance", "cam00,cam04=1.5"]) == 0
     assert not list(temporary.iterdir())
     return json.loads(file.read_text())
-
-
-def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest distance of centres as a share of the rig's extent, and angle in degrees, after alignment."""
-    u, _, v = np.linalg.svd(sum(true[:, :3, :3] @ found[:, :3, :3].transpose(0, 2, 1)))
-    turn = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
-    a, b = found[:, :3, 3] @ turn.T, true[:, :3, 3]
-    a, b = a - a.mean(0), b - b.mean(0)
-    centres = np.linalg.norm(a * (a * b).sum() / (a * a).sum() - b, axis=1).max()
-    trace = np.einsum("nij,nij->n", true[:, :3, :3], turn @ found[:, :3, :3])
-    return centres / np.linalg.norm(np.ptp(b, axis=0)), np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))).max()
 
 
 def test_all_cameras_of_a_still_rig_are_placed(document):

@@ -75,3 +75,16 @@ def test_a_jump_of_a_moving_camera_is_named():
     (said,) = doubts("moving camera", NAMES, structure(centres))
     assert said.startswith("the path jumps between cam09 and cam10:")
     assert doubts("photographs", NAMES, structure(centres)) == []
+
+
+def test_several_moving_cameras_are_named_by_camera():
+    names = [*(f"ann/{number:06d}" for number in range(12)), *(f"bob/{number:06d}" for number in range(12)), "still"]
+    centres = line(25)
+    centres[12:] += [0, 90, 0]  # no jump: another camera
+    pairs = {(1, 2): Pair(90, 50, 0.3), (13, 24): Pair(90, 50, 0.1)}
+    (said,) = doubts("moving cameras", names, structure(centres, pairs))
+    assert said.startswith("matches of 2 of 12 pictures of ann, 1 of 12 pictures of bob, still contradict where")
+    centres[6:12] += [0, 40, 0]
+    assert doubts("moving cameras", names, structure(centres))[0].startswith(
+        "the path jumps between ann/000005 and ann/000006:"
+    )

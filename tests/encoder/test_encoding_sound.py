@@ -113,7 +113,7 @@ def test_a_name_of_no_track_is_refused_before_cameras_are_looked_for(folder, tmp
 
 
 def test_silent_videos_make_no_sound(dataset, folder, tmp_path, capsys):
-    only = replace(dataset, pictures=replace(dataset.pictures, file=("cam00.mp4",) * len(dataset.pictures)))
+    only = replace(dataset, films={"cam00.mp4": dataset.films["cam00.mp4"]})
     assert find_sound(options(), only) == (None, "auto")
     assert "no video has a sound track" in capsys.readouterr().err
     assert find_sound(options(), replace(dataset, video_start_s=None)) == (None, "auto")  # images

@@ -28,8 +28,10 @@ pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.2), mo
 adjusted, counts = worker._adjust, []
 worker._adjust = lambda tried: (counts.append(tried.num_points3D()), adjusted(tried))
 worker.COMPARED = 600
-camera = worker._with_best_cameras(model, False).cameras[1]
-said = {"counts": counts, "model": camera.model_name, "focal": camera.params[0], "views": worker._matching_views(file)}
+camera = worker._with_best_cameras(model, [[0] * 8]).cameras[1]
+said = {"counts": counts[:], "model": camera.model_name, "focal": camera.params[0]}
+said["views"] = worker._matching_views(file)
+said["cameras"] = len(worker._with_best_cameras(model, [[0] * 8, [0, 1] * 4]).cameras)
 print(json.dumps(said))
 """
 
@@ -50,3 +52,7 @@ def test_some_points_choose_the_lens_and_all_adjust_it(said):
 
 def test_views_that_match_none_are_not_waited_for(said):
     assert said["views"] == 8
+
+
+def test_cameras_share_a_lens_unless_the_points_speak_against_it(said):
+    assert said["cameras"] == 1

@@ -53,3 +53,8 @@ def test_each_picture_is_matched_with_those_most_like_it():
     counts = {(0, 1): 50, (0, 2): 20, (1, 2): 30, (2, 3): 10, (0, 3): 9, (1, 3): 2}
     assert alike_pairs(counts, 1) == [(0, 1), (1, 2), (2, 3)]
     assert alike_pairs(counts, 2) == [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)]  # (1, 3) matches by chance
+
+
+def test_pictures_that_look_alike_are_sought_in_each_group():
+    counts = {(0, 1): 90, (0, 2): 9, (0, 3): 8, (1, 2): 4, (1, 3): 5, (2, 3): 70}
+    assert alike_pairs(counts, 1, [0, 0, 1, 1]) == [(0, 1), (0, 2), (0, 3), (1, 3), (2, 3)]

@@ -3,11 +3,14 @@
 Source: https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
+from dataclasses import replace
 from pathlib import Path
 
-from kpc.encoder.datasets.capture import Capture, first_names, holdout_flags, natural_key
+from kpc.encoder.datasets.capture import Capture, CapturedView, first_names, holdout_flags, natural_key
 from kpc.encoder.datasets.layouts.splits import split_of
 from kpc.encoder.datasets.layouts.transforms import (
+    clip_frames,
+    films_of,
     find_images,
     frame_rate,
     frame_view,
@@ -17,12 +20,14 @@ from kpc.encoder.datasets.layouts.transforms import (
 from kpc.encoder.datasets.left_out import media_in
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media_files import is_video
+from kpc.format.scene.camera_checks import number_of
 
 # The layout's name in messages.
 NAME = "nerfstudio"
 
-# What a document of `kpposes` says it was made by.
-MADE_BY = "kpposes"
+# What a document of `kpposes` says it was made by, and the folder beside it that holds the frames of moving cameras,
+# of several in a folder for each.
+MADE_BY, IMAGES = "kpposes", "images"
 
 
 def recognise(path: Path) -> bool:
@@ -30,7 +35,7 @@ def recognise(path: Path) -> bool:
     return (path / "transforms.json").is_file()
 
 
-def read(path: Path, holdout: str | None, transforms: Path | None = None) -> Capture:
+def read(path: Path, holdout: str | None, transforms: Path | None = None, footage: Path | None = None) -> Capture:
     """Read the folder. Test pictures are what the document lists, else every eighth existing image (`split_of`).
 
     With `holdout`, the document's lists are ignored, and all other pictures are trained on. A document of `kpposes`
@@ -40,6 +45,7 @@ def read(path: Path, holdout: str | None, transforms: Path | None = None) -> Cap
         path: the folder.
         holdout: as for `holdout_flags`.
         transforms: the document, if it lies elsewhere.
+        footage: the folder of the videos from which the images were taken, if it is another.
 
     Raises:
         DatasetError, MediaError: the JSON, an image or a video cannot be used.
@@ -70,4 +76,16 @@ def read(path: Path, holdout: str | None, transforms: Path | None = None) -> Cap
     left_out = tuple(image for image, part in zip(images, split, strict=True) if part is None)
     in_folders = tuple(media for folder in sorted({image.parent for image in images}) for media in media_in(folder))
     is_ours = document.get("made_by") == MADE_BY
-    return Capture(NAME, views, frame_rate(file, document), in_folders, left_out, is_ours)
+    views = _named_by_folder(path, views) if is_ours else views
+    fps, frame_count = frame_rate(file, document), clip_frames(file, document)
+    sources = films_of(footage or path, file, document)
+    start_s = number_of(str(file), document, "start_s") if sources else None
+    return Capture(NAME, views, fps, in_folders, left_out, is_ours, frame_count, sources, start_s)
+
+
+def _named_by_folder(path: Path, views: tuple[CapturedView, ...]) -> tuple[CapturedView, ...]:
+    """Name the pictures of several cameras by their folders, too, where the files alone do not: "cam00/000012"."""
+    if len({view.file.stem for view in views}) == len(views):
+        return views
+    names = [view.file.relative_to(path).with_suffix("").as_posix() for view in views]
+    return tuple(replace(view, camera=name.removeprefix(f"{IMAGES}/")) for view, name in zip(views, names, strict=True))

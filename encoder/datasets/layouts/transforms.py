@@ -11,6 +11,7 @@ from typing import Any
 
 from kpc.encoder.datasets.capture import (
     CapturedView,
+    Film,
     Lens,
     MaskFile,
     file_exists,
@@ -34,6 +35,9 @@ SAME_FOCAL = 0.02
 
 # Frame rates that are believed, frames per second: from a picture in a quarter of an hour to a high-speed camera.
 LEAST_FPS, GREATEST_FPS = 1e-3, 1e3
+
+# A clip has so many frames for each picture at most: some may not have been placed.
+FRAMES_PER_PICTURE = 100
 
 # Clocks that are believed: the largest offset in seconds, and how much faster one may run.
 LONGEST_OFFSET_S, GREATEST_RATE = 1e5, 2.0
@@ -133,9 +137,13 @@ def _video_view(where: str, keys: dict[str, Any], video: Path, is_test: bool) ->
     view = video_view(video, where, lens, pose_of(where, keys), is_test)
     near, far = number_of(where, keys, "near", math.nan), number_of(where, keys, "far", math.nan)
     check_depths(where, near, far)
+    return replace(view, near=near, far=far, clock=_clock(where, keys))
+
+
+def _clock(where: str, keys: dict[str, Any]) -> tuple[float, float]:
     offset, rate = number_of(where, keys, "time_offset", 0.0), number_of(where, keys, "time_rate", 1.0)
     check_clock(where, ("time_offset", "time_rate"), offset, rate)
-    return replace(view, near=near, far=far, clock=(offset, rate))
+    return offset, rate
 
 
 def check_clock(where: str, names: tuple[str, str], offset_s: float, rate: float) -> None:
@@ -183,6 +191,40 @@ def frame_rate(file: Path, document: dict[str, Any]) -> float | None:
     if not LEAST_FPS <= fps <= GREATEST_FPS:
         raise DatasetError(f"{file}: fps {fps:g} is not from {LEAST_FPS:g} to {GREATEST_FPS:g}; correct it")
     return fps
+
+
+def clip_frames(file: Path, document: dict[str, Any]) -> int | None:
+    """Return the frames of the clip from the key `frame_count`, an extension of KPC; None if it is absent."""
+    if document.get("frame_count") is None:
+        return None
+    count, most = number_of(str(file), document, "frame_count"), FRAMES_PER_PICTURE * len(document["frames"])
+    if not (1 <= count <= most and count == round(count)):
+        raise DatasetError(f"{file}: frame_count {count:g} is no whole number from 1 to {most}; correct it")
+    return round(count)
+
+
+def films_of(root: Path, file: Path, document: dict[str, Any]) -> dict[str, Film]:
+    """Return the videos that are there from which images were taken, from the key `videos`, an extension of KPC.
+
+    Args:
+        root: the folder of the videos.
+        file: the document's path, for messages.
+        document: from `load_transforms`.
+
+    Raises:
+        DatasetError: an entry names no file of the folder, or has a clock that none has.
+    """
+    entries, films = document.get("videos") or [], {}
+    if not (isinstance(entries, list) and all(isinstance(entry, dict) for entry in entries)):
+        raise DatasetError(f"{file}: videos is not a list of objects; run kpposes anew")
+    for number, entry in enumerate(entries):
+        where, name = f"{file} video {number}", entry.get("file_path")
+        if not isinstance(name, str):
+            raise DatasetError(f"{where}: lacks file_path; run kpposes anew")
+        video = find_image(root, file, name)
+        if video is not None and is_video(video):
+            films[video.relative_to(root).as_posix()] = Film(video, _clock(where, entry))
+    return films
 
 
 def _merged(document: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
