@@ -5,6 +5,7 @@ multiplied by it.
 """
 
 import contextlib
+import errno
 import functools
 import itertools
 import os
@@ -26,6 +27,9 @@ from kpc.format.common.text import valid_unicode
 
 # Options of ffmpeg's scale filter for an exact colour conversion.
 SCALE_FLAGS = "bicubic+accurate_rnd+full_chroma_int+full_chroma_inp"
+
+# What ffmpeg's log says where a disk is full or fails. Its exit code may be 0 even so.
+DISK_FAILURES = tuple(os.strerror(code) for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO))
 
 FFMPEG_WHITE = 0xFF00  # white in the R'G'B' of 16 bits that ffmpeg's scale filter converts, as 8-bit white times 256
 
@@ -180,7 +184,7 @@ def write_film(
         sound: a WAV file that begins with the first frame.
 
     Raises:
-        MediaError: there are no frames, frames differ in size or type, or ffmpeg fails.
+        MediaError: there are no frames, frames differ in size or type, ffmpeg fails, or the disk does or is full.
     """
     frames = iter(frames)
     first = next(frames, None)
@@ -211,8 +215,11 @@ def write_film(
             process.wait()
             with contextlib.suppress(BrokenPipeError):
                 process.stdin.close()
+        said = read_log(log)
+        if (failure := next((text for text in DISK_FAILURES if text in said), None)) is not None:
+            raise MediaError(f"{path}: {failure}; make room there, or choose another place")
         if code != 0:
-            reason = main_error(read_log(log))
+            reason = main_error(said)
             raise MediaError(f"{path}: ffmpeg's encoder {film_format.encoder} cannot write {width}x{height} ({reason})")
     return count
 

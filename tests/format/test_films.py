@@ -1,5 +1,6 @@
 """Films have the codec, bits, alpha and colour tags that are asked for, and all their frames."""
 
+import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -162,6 +163,21 @@ def test_failed_writing_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(MediaError, match="cannot write"):
         write_video(tmp_path / "x.mp4", [np.zeros((16, 16, 3), np.uint8)] * 5, 10, pix_fmt="no_such_format")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a shell script stands in for ffmpeg")
+def test_a_full_disk_is_an_error_whatever_ffmpeg_returns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As ffmpeg 5.1 does, whose exit code is 0 if the end of a file cannot be written."""
+    script = tmp_path / "ffmpeg"
+    script.write_text(
+        '#!/bin/sh\nfor file; do :; done\ncat > "${file#file:}"\n'
+        'echo "av_interleaved_write_frame(): No space left on device" >&2\n'
+    )
+    monkeypatch.setattr(films, "ffmpeg_binary", lambda: str(script))
+    script.chmod(0o755)
+    with pytest.raises(MediaError, match=r"x\.mp4: No space left on device; make room"):
+        write_video(tmp_path / "x.mp4", [np.zeros((16, 16, 3), np.uint8)], 10)
+    assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]
 
 
 def test_ffmpeg_is_that_of_the_path_or_the_wheel(monkeypatch: pytest.MonkeyPatch) -> None:
