@@ -50,7 +50,8 @@ def describe_origin(options: Options, dataset: Dataset, cameras: list[int], data
         for option in fields
         if option not in NOT_RECORDED and fields[option] != getattr(Options, option, None)
     }
-    metadata = Metadata(dict(options.members)).with_members(
+    metadata = Metadata().with_members(
+        **options.members,
         transparent=True if dataset.has_alpha else None,
         camera_names=[_printable(name) for name in names] or None,
     )

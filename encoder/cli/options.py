@@ -53,7 +53,7 @@ class Options:
             (`kpc.encoder.evaluation.testing_time`), ALL_VIEWS for all.
         downscale: side of the blocks of pixels that are averaged; None for `most_across` pixels at most.
         cache: the folder of decoded pixels, which is kept; None for the work folder.
-        members: of the file's metadata: title, description, author, licence and date.
+        members: of the file's metadata: title, description, author, licence and date; None removes one.
         view_limits: "auto", "none", or members of the view limits (`kpc.format.container.metadata_options`); None for
             "auto", or where nothing is trained for those of the source.
         audio: "auto", "none", a camera or a file.
@@ -90,7 +90,7 @@ class Options:
     keep_checkpoint: Path | None = None
     tune_steps: int | None = None
     preview: Path | None = None
-    members: Mapping[str, str] = field(default_factory=dict)
+    members: Mapping[str, str | None] = field(default_factory=dict)
     view_limits: str | Mapping[str, Any] | None = None
     audio: str = "auto"
     audio_bitrate: int | None = None

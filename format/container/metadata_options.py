@@ -46,8 +46,8 @@ def add_metadata_options(parser: argparse.ArgumentParser) -> None:
 
 
 def members_from(given: argparse.Namespace) -> dict[str, Any]:
-    """Return the texts that are given, as members of the metadata."""
-    return {name: getattr(given, name) for name in TEXTS if getattr(given, name) is not None}
+    """Return the texts that are given, as members of the metadata; None for empty ones, which remove a member."""
+    return {name: getattr(given, name) or None for name in TEXTS if getattr(given, name) is not None}
 
 
 def view_limits(text: str) -> str | dict[str, Any]:

@@ -41,11 +41,12 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 def test_a_file_says_how_it_was_made(dataset: Dataset) -> None:
     options, *_ = parse(
-        ["set", "-o", "out.kpc", "--title", "Me", "--seed", "5", "--tune-steps", "3", "--quality", "50"]
+        ["set", "-o", "out.kpc", "--title", "Me", "--seed", "5", "--tune-steps", "3", "--quality", "50", "--author", ""]
     )
     found = describe(options, dataset, scene_of_five(), [0, 2], "0" * 64)
     made = found.provenance
-    assert found.title == "Me" and made["seed"] == 5 and made["encoder"].startswith("kpc ")
+    assert found.title == "Me" and "author" not in found.document
+    assert made["seed"] == 5 and made["encoder"].startswith("kpc ")
     assert made["options"] == {"tune_steps": 3, "quality": 50} and made["layout"] == "N3DV"
     assert found.camera_names == ("cam00", "cam01") and "transparent" not in found.document
     pack_metadata(found)  # a reader accepts it
@@ -100,12 +101,14 @@ def test_coding_a_file_again_keeps_what_it_says(tmp_path: Path, capsys: pytest.C
     scene = replace(scene_of_five(), metadata=Metadata(FULL))
     scene_writer.write(quantise_scene(scene, [dict.fromkeys(scene.scales[0], 0.05)]), tmp_path / "in.kpc")
     options = ["--quality", "40", "--tune-steps", "0", "--title", "New", "--view-limits", "reach=0.5,distance=50:60"]
+    options += ["--author", ""]
     assert kpenc.main([str(tmp_path / "in.kpc"), "-o", str(tmp_path / "out.kpc"), *options]) == 0
     said = [line for line in capsys.readouterr().err.splitlines() if "limits" in line]
     outside = "the opening view lies outside the limits of its elevation and distance, and players move it within"
     assert said == [f"kpenc: {outside}; kpedit --open-at sets another"]
     found = scene_io.read(tmp_path / "out.kpc").metadata
-    changed = ("title", "view_limits", "provenance")
+    assert "author" in FULL and "author" not in found.document
+    changed = ("title", "view_limits", "provenance", "author")
     assert {k: v for k, v in found.document.items() if k not in changed} == {
         k: v for k, v in FULL.items() if k not in changed
     }

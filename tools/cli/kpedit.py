@@ -235,7 +235,7 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement:
 
     `--up` and `--metres-per-unit` are meant for the scene where it is put, so they are taken back from there.
     """
-    members: dict[str, Any] = {name: text or None for name, text in members_from(options).items()}
+    members = members_from(options)
     if options.up is not None:
         up = np.array(options.up, float)
         members["up"] = (up if placement is None else up @ placement.turn).tolist()
