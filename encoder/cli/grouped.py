@@ -96,7 +96,7 @@ def options_of_group(
     if trade.target_bytes is not None:
         parts = frames / np.where(np.arange(len(spans)), 1.0, 1 - still_share)
         share = parts[number] / parts.sum()
-        texts = sum(len(text.encode()) for text in options.members.values())
+        texts = sum(len(text.encode()) for text in options.members.values() if text)
         beside = ENTRY.size * (len(spans) + 1) + CLIP_BYTES + texts
         trade = Trade(target_bytes=int(share * max(1, trade.target_bytes - HEADER.size - beside)) + shared)
     if budget_s is not None:

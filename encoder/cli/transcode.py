@@ -12,7 +12,7 @@ from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.rdo import codec_model
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.common import cli
-from kpc.format.common.errors import UsageError
+from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.common.text import notice
 from kpc.format.common.version import VERSION
 from kpc.format.container import groups, rewriting, scene_io
@@ -114,7 +114,11 @@ def _transcode_groups(options: Options, source: groups.Groups) -> dict[str, Any]
         scene = replace(scene_io.read(reader), cameras=reader.cameras() or source.cameras(), metadata=metadata)
         notice(f"group {number} of {len(spans)}")
         model = replace(codec_model.model_from_file(scene), shown=True, sharing=shared.of_group(number))
-        coded = codec_model.code(model, trade, TrainConfig().prune_share, _tune_steps(options))
+        try:
+            coded = codec_model.code(model, trade, TrainConfig().prune_share, _tune_steps(options))
+        except TrainingError as error:
+            what = f"group {number} of {len(spans)}, with the planes that it shares with others"
+            raise TrainingError(f"{what}: {error}; each group has a share of the size by its frames") from error
         shared.settle(number, coded)
         is_copy = is_copy and coded.scene is model.coded
         parts.append(groups.GroupInput.of(coded.data, span.start))

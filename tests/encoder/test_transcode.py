@@ -269,6 +269,20 @@ def test_a_size_below_what_no_step_shrinks_is_refused_before_the_search(
     assert "occupancy, cameras, metadata, sound) takes" in refused(scene_file, "--target-size", "4KB")
 
 
+def test_a_group_that_cannot_keep_to_its_share_is_named(
+    scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    groups.write(groups.group_inputs([scene_file, scene_file]), tmp_path / "clip.kpc")
+
+    def fail(*arguments: object) -> None:
+        raise TrainingError("9 bytes is the smallest size of this model")
+
+    monkeypatch.setattr(codec_model, "code", fail)
+    assert kpenc.main([str(tmp_path / "clip.kpc"), "-o", str(tmp_path / "out.kpc"), "--max-loss", "0.1dB"]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("kpenc: group 0 of 2, with the planes that it shares with others: 9 bytes is the smallest")
+
+
 def test_a_file_cannot_be_coded_to_a_psnr(scene_file: Path, refused: Callable[..., str]) -> None:
     assert "checkpoint" in refused(scene_file, "--psnr", "30dB", code=2)
 

@@ -44,7 +44,7 @@ def test_records_of_equal_settings_are_compared(tmp_path: Path, capsys: pytest.C
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith('better encode room {"preset": "fast"}: size_bytes 9 -> 8 (-11.1%)')
     assert [line.split(":")[0] for line in lines[1:3]] == [f"only in {files[0]}", f"only in {files[1]}"]
-    assert lines[3] == "1 records compared: 1 better, 0 worse"
+    assert lines[3] == "1 record compared: 1 better, 0 worse"
     assert main(["compare", *map(str, reversed(files))]) == 1
     assert "1 figure is worse" in capsys.readouterr().err
 
@@ -55,3 +55,10 @@ def test_what_holds_no_records_is_one_line(tmp_path: Path, capsys: pytest.Captur
         (tmp_path / "x.json").write_text(text)
         assert main(["compare", str(tmp_path / "x.json"), str(tmp_path / "x.json")]) == 1
         assert f"x.json: {said}; write it with kpbench --out" in capsys.readouterr().err
+
+
+def test_records_of_nothing_in_common_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("room", "liam"):
+        (tmp_path / f"{name}.json").write_text(json.dumps([record({"size_bytes": 9}, name=name)]))
+    assert main(["compare", str(tmp_path / "room.json"), str(tmp_path / "liam.json")]) == 2
+    assert "have no record of the same measurement" in capsys.readouterr().err

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kpc.format.common import cli
-from kpc.format.common.errors import KpcError
+from kpc.format.common.errors import KpcError, UsageError
+from kpc.format.common.text import counted
 from kpc.tools.bench.records import Record, load
 
 # Endings of the names of figures of which more is better, and of which less is; those of both kinds of time.
@@ -70,6 +71,7 @@ def main(argv: Sequence[str]) -> None:
 
     Raises:
         FormatError: a file holds no records.
+        UsageError: they have no record in common.
         WorseError: something is worse.
     """
     parser = cli.Parser(
@@ -83,6 +85,10 @@ def main(argv: Sequence[str]) -> None:
     )
     options = parser.parse_args(argv)
     before, after = (_by_title(path) for path in (options.before, options.after))
+    if not before.keys() & after.keys():
+        raise UsageError(
+            f"{options.before} and {options.after} have no record of the same measurement: none to compare"
+        )
     found = [
         change
         for title in before.keys() & after.keys()
@@ -93,7 +99,9 @@ def main(argv: Sequence[str]) -> None:
     for title in sorted(before.keys() ^ after.keys()):
         print(f"only in {options.before if title in before else options.after}: {title}")
     worse = sum(not change.is_better for change in found)
-    print(f"{len(before.keys() & after.keys())} records compared: {len(found) - worse} better, {worse} worse")
+    print(
+        f"{counted(len(before.keys() & after.keys()), 'record')} compared: {len(found) - worse} better, {worse} worse"
+    )
     if worse:
         raise WorseError(f"{worse} figure{'s are' if worse > 1 else ' is'} worse than before")
 
