@@ -1,4 +1,4 @@
-"""The picture that stands for a scene before it plays: its opening view."""
+"""The picture that stands for a scene before it plays: its opening view, in the shape that players have by default."""
 
 import argparse
 
@@ -9,10 +9,11 @@ from kpc.format.container.groups import GroupedScene
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Part
+from kpc.format.scene.view_limits import OPENING_ASPECT
 from kpc.player.viewpoints import fit_camera
 from kpc.tools.rendering.content import renderer_of
 
-# Longest side in pixels; without OpenGL, where a picture of that size takes minutes.
+# Width in pixels; without OpenGL, where a picture of that size takes minutes.
 SIDE, SLOW_SIDE = 1200, 480
 
 
@@ -35,7 +36,5 @@ def render_poster(loaded: Scene | GroupedScene) -> np.ndarray:
         options.backend = "reference"
         render, _ = renderer_of(loaded, options)
         side = SLOW_SIDE
-    shrink = side / max(camera.width, camera.height)
-    size = max(round(camera.width * shrink), 1), max(round(camera.height * shrink), 1)
-    picture = render(fit_camera(camera, *size), time)
+    picture = render(fit_camera(camera, side, round(side / OPENING_ASPECT)), time)
     return np.round(np.clip(picture.rgb, 0, 1) * 255).astype(np.uint8)

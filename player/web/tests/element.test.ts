@@ -1,6 +1,7 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 import { KpcError } from '../src/container/errors.js';
+import { Beginning } from '../src/element/beginning.js';
 import { Clock } from '../src/element/clock.js';
 import { clockText } from '../src/element/controls/timeline.js';
 import { actionOf, flightOf, KEY_BINDINGS } from '../src/element/keyboard.js';
@@ -151,4 +152,21 @@ test('times are minutes and seconds', () => {
   assert.equal(clockText(61.26), '1:01');
   assert.equal(clockText(0.3, true), '0:00.3');
   assert.equal(clockText(2.4166, true), '0:02.4');
+});
+
+test('a clip begins by its link, by what is set, or where it was left', () => {
+  const beginning = new Beginning();
+  const link = { time: 1.5, camera: 'left' };
+  beginning.time = 0.25;
+  assert.deepEqual(beginning.take('a.kpc', link), { ...link, wasPlaying: null });
+  assert.deepEqual(beginning.take('b.kpc', link), { time: null, camera: null, wasPlaying: null });
+  beginning.leave(2, '1 2 3 0 0 0', true);
+  assert.equal(beginning.known, 2);
+  assert.deepEqual(beginning.take('a.kpc', link), { time: 2, camera: '1 2 3 0 0 0', wasPlaying: true });
+  beginning.leave(2, '1 2 3 0 0 0', true);
+  beginning.time = 0.5;
+  assert.deepEqual(beginning.take('a.kpc', link), { time: 0.5, camera: '1 2 3 0 0 0', wasPlaying: true });
+  beginning.leave(2, '1 2 3 0 0 0', false);
+  beginning.forget();
+  assert.deepEqual(beginning.take('c.kpc', null), { time: null, camera: null, wasPlaying: null });
 });

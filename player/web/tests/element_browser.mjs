@@ -133,6 +133,26 @@ scenario('draws what the reference draws', async () => {
   return value;
 });
 
+scenario('makes a file of what was asked for just before, in sight or not', async () => {
+  const page = await open(TAG);
+  await shown(page);
+  const pictures = await player(page, async (it) => {
+    const drawn = async (change) => {
+      change();
+      return new Uint8Array(await (await it.toBlob()).arrayBuffer()).join();
+    };
+    const found = [await drawn(() => {})];
+    found.push(await drawn(() => Object.assign(it, { camera: it.cameras[3] })));
+    found.push(await drawn(() => Object.assign(it, { currentTime: 1.5 })));
+    it.style.marginTop = '4000px';
+    await new Promise((resolve) => setTimeout(resolve, 300));
+    found.push(await drawn(() => Object.assign(it, { camera: it.cameras[5] })));
+    return found;
+  });
+  assert.equal(new Set(pictures).size, 4);
+  await close(page);
+});
+
 scenario('knows the viewpoints of the desktop player', async () => {
   const page = await open(TAG);
   await shown(page);
@@ -722,6 +742,10 @@ scenario('draws coarsely where the card lacks memory, before it gives up', async
 
 scenario('shows the poster and loads nothing before it is asked to', async () => {
   const page = await open(TAG.replace('muted', 'muted preload="none" poster="poster.png"'));
+  await page.waitForTimeout(200);
+  await player(page, (it) => {
+    it.src = 'scene.kpc?again';
+  });
   await page.waitForTimeout(200);
   assert.deepEqual(await events(page), []);
   assert.equal(await inside(page, '.poster').evaluate((it) => it.naturalWidth > 0), true);

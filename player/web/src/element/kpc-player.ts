@@ -2,6 +2,7 @@
 
 import { string, upgrade } from './attributes.js';
 import { AudibleElement } from './audible_element.js';
+import { Beginning } from './beginning.js';
 import { textOfView } from './camera/view.js';
 import { Clock, type ClockEvent } from './clock.js';
 import type { Model } from './controls/panels.js';
@@ -24,13 +25,6 @@ const PROPERTIES = [
 const PROGRESS_MS = 350;
 const HAVE_FUTURE_DATA = 3;
 
-/** What a player goes on with when it is put back into a page. */
-interface Resumed {
-  time: number;
-  view: string;
-  wasPlaying: boolean;
-}
-
 const connected = new Set<KpcPlayer>();
 
 export class KpcPlayer extends AudibleElement implements Model {
@@ -50,10 +44,7 @@ export class KpcPlayer extends AudibleElement implements Model {
   #keepsLimits = true;
   #hasPlayed = false;
   readonly #plays = new PlayPromises();
-  /** Where to begin, and from where to look, before that can be done. */
-  #startTime: number | null = null;
-  #startView: string | null = null;
-  #resumed: Resumed | null = null;
+  readonly #beginning = new Beginning();
   #readyState = 0;
   #progressAt = Number.NEGATIVE_INFINITY;
   readonly #scroll = new PageScroll();
@@ -107,7 +98,7 @@ export class KpcPlayer extends AudibleElement implements Model {
       window.removeEventListener('hashchange', this.#followLink);
       const view = this.#session?.view;
       if (view) {
-        this.#resumed = { time: this.#clock.time, view: textOfView(view.view), wasPlaying: !this.#clock.paused };
+        this.#beginning.leave(this.#clock.time, textOfView(view.view), !this.#clock.paused);
       }
       this.#stop();
     });
@@ -115,7 +106,7 @@ export class KpcPlayer extends AudibleElement implements Model {
 
   attributeChangedCallback(name: string, before: string | null, value: string | null): void {
     if (before === value) return;
-    if (name === 'src' && connected.has(this)) this.load();
+    if (name === 'src') this.#begin();
     if (name === 'poster') this.#ui.setPoster(this.poster);
     if (name === 'loop') this.#clock.loop = this.loop;
     if (name === 'camera' && value !== null) this.camera = value;
@@ -134,11 +125,11 @@ export class KpcPlayer extends AudibleElement implements Model {
 
   set srcObject(file: Blob | null) {
     this.#file = file;
-    if (this.isConnected) this.load();
+    this.#begin();
   }
 
   get currentTime(): number {
-    return this.#session?.clip ? this.#clock.time : (this.#startTime ?? 0);
+    return this.#session?.clip ? this.#clock.time : (this.#beginning.known ?? 0);
   }
 
   set currentTime(seconds: number) {
@@ -147,7 +138,7 @@ export class KpcPlayer extends AudibleElement implements Model {
       this.#clock.seek(seconds);
       this.#fetch();
     } else {
-      this.#startTime = Math.max(seconds, 0);
+      this.#beginning.time = Math.max(seconds, 0);
     }
   }
 
@@ -219,11 +210,7 @@ export class KpcPlayer extends AudibleElement implements Model {
 
   /** Begin anew, with whatever `src` names now. */
   load(): void {
-    this.#stop();
-    this.#resumed = null;
-    this.#hasPlayed = false;
-    this.#start(true);
-    this.#refresh();
+    this.#begin(true);
   }
 
   /** Pause, and go some frames forward. */
@@ -242,14 +229,14 @@ export class KpcPlayer extends AudibleElement implements Model {
   /** From where to look: the eye, the point looked at, and the vertical angle of view in degrees. */
   get camera(): string {
     const view = this.#session?.view;
-    return view ? textOfView(view.view) : (this.#startView ?? string(this, 'camera'));
+    return view ? textOfView(view.view) : (this.#beginning.view ?? string(this, 'camera'));
   }
 
   /** A name of `presets` or `cameras`, "opening", or six or seven numbers. */
   set camera(text: string) {
     const session = this.#session;
     if (!session?.view) {
-      this.#startView = text;
+      this.#beginning.view = text;
       return;
     }
     const view = session.viewOf(text);
@@ -317,6 +304,16 @@ export class KpcPlayer extends AudibleElement implements Model {
 
   // --- inside
 
+  /** Forget what was shown, and open what `src` names now; with preload="none" only if `isAsked`. */
+  #begin(isAsked = false): void {
+    this.#beginning.forget();
+    if (!connected.has(this)) return;
+    this.#stop();
+    this.#hasPlayed = false;
+    this.#start(isAsked);
+    this.#refresh();
+  }
+
   /** Open what `src` names; with preload="none" only if `isAsked`. */
   #start(isAsked = false): void {
     const src = this.#file ?? this.src;
@@ -377,16 +374,14 @@ export class KpcPlayer extends AudibleElement implements Model {
     if (!this.#keepsLimits) view.toggleLimits();
     const { duration, frameCount, metadata } = clip;
     Object.assign(this.#clock, { duration, frameCount });
-    const link = this.#resumed ? null : momentOf(location.hash, this.id, this.#isFirst);
-    const { time, view: resumedView } = this.#resumed ?? { time: null, view: null };
-    this.#clock.begin(link?.time ?? time ?? this.#startTime ?? (metadata.opening?.time ?? 0) * duration);
-    const text = link?.camera ?? resumedView ?? this.#startView ?? string(this, 'camera');
+    const from = this.#beginning.take(this.src, momentOf(location.hash, this.id, this.#isFirst));
+    this.#clock.begin(from.time ?? (metadata.opening?.time ?? 0) * duration);
+    const text = from.camera ?? string(this, 'camera');
     if (text !== '') this.camera = text;
     this.#ui.setTitle(typeof metadata.title === 'string' ? metadata.title : '');
     this.#emit('durationchange');
     this.#emit('loadedmetadata');
-    if (this.#resumed ? this.#resumed.wasPlaying && this.autoplay : this.autoplay) this.#playByItself();
-    [this.#resumed, this.#startTime, this.#startView] = [null, null, null];
+    if (this.autoplay && from.wasPlaying !== false) this.#playByItself();
     if (duration === 0 && !this.#clock.paused) this.#clock.pause();
     this.#refresh();
   }

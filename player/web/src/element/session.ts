@@ -71,6 +71,8 @@ export class Session {
   #headset: Headset | null = null;
   #size: [number, number] = [0, 0];
   #isInSight = true;
+  /** How many wait for a picture, who see it wherever the element is. */
+  #askers = 0;
   #isReduced = false;
   #isSharp = false;
   #isKnownIncomplete = false;
@@ -224,10 +226,15 @@ export class Session {
   /** Return the picture as a file, once it is as fine as it will be; while the clip plays, at once. */
   async toBlob(type: string, quality?: number): Promise<Blob> {
     const { clock } = this.#options;
-    for (let frames = 0; frames < 600 && clock.paused && !this.#isSharp && !this.#isClosed; frames++) {
+    this.#isSharp = false; // a view or a time may have been set since the last frame
+    this.#askers++;
+    for (let frames = 0; frames < 600 && clock.paused && !this.#isClosed; frames++) {
       this.wake();
       await new Promise(requestAnimationFrame);
+      if (clock.isSeeking && this.clip?.error === null) frames = 0;
+      else if (this.#isSharp) break;
     }
+    this.#askers--;
     if (this.#picture === null || !this.isShown) throw new DOMException('there is no picture yet', 'InvalidStateError');
     return this.#picture.toBlob(type, quality);
   }
@@ -293,7 +300,7 @@ export class Session {
     const { time, isSeeking } = this.#options.clock;
     const camera = cameraOf(view.view, width, height);
     // Nothing that is worse than the poster, or than the picture before a jump.
-    if (!this.#isInSight || !(clip.canShow(time) || (this.isShown && !isSeeking))) {
+    if (!(this.#isInSight || this.#askers > 0) || !(clip.canShow(time) || (this.isShown && !isSeeking))) {
       const isPrepared = this.#picture.prepare(clip, camera, this.#shownOptions());
       this.#isSharp = isPrepared && !isTaking;
       return;
