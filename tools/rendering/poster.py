@@ -8,8 +8,8 @@ from kpc.format.common.errors import DisplayError
 from kpc.format.container.groups import GroupedScene
 from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
-from kpc.player.cpu.reference import Part
 from kpc.format.scene.view_limits import OPENING_ASPECT
+from kpc.player.cpu.reference import Part
 from kpc.player.viewpoints import fit_camera
 from kpc.tools.rendering.content import renderer_of
 
