@@ -84,6 +84,23 @@ test('steps go to whole frames, and speeds through a list', () => {
   assert.equal(clock.rate, 0.1);
 });
 
+test('times and steps that are no finite numbers are refused', () => {
+  const { clock, take } = clockOf();
+  clock.begin(1);
+  clock.play();
+  take();
+  for (const odd of [Number.NaN, Infinity, undefined, 'x', {}] as number[]) {
+    assert.throws(() => clock.step(odd), TypeError);
+    assert.throws(() => clock.seek(odd), TypeError);
+    assert.throws(() => clock.begin(odd), TypeError);
+  }
+  assert.deepEqual([clock.time, clock.paused, take()], [1, false, '']);
+  clock.step('2' as unknown as number);
+  assert.ok(Math.abs(clock.time - 1.2) < 1e-9);
+  clock.step(-1.5);
+  assert.ok(Math.abs(clock.time - 1.1) < 1e-9);
+});
+
 test('time stands still while the timeline is dragged', () => {
   const { clock } = clockOf();
   clock.play();

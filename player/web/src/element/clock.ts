@@ -1,5 +1,7 @@
 /** Where a clip plays, with the events of HTMLMediaElement. No page, no timers: `tick` is called for each frame. */
 
+import { finite } from './values.js';
+
 export type ClockEvent =
   | 'play'
   | 'pause'
@@ -82,7 +84,7 @@ export class Clock {
 
   /** Begin a clip at a time, without an event. */
   begin(time: number): void {
-    this.#time = Math.min(Math.max(time, 0), this.duration);
+    this.#time = Math.min(Math.max(finite(time, 'currentTime'), 0), this.duration);
   }
 
   /** Play; from the start, if the clip has ended. */
@@ -104,7 +106,7 @@ export class Clock {
 
   /** Go to a time, clamped to the clip. */
   seek(time: number): void {
-    this.#time = Math.min(Math.max(time, 0), this.duration);
+    this.#time = Math.min(Math.max(finite(time, 'currentTime'), 0), this.duration);
     this.#ended = false;
     this.#isSeeking = true;
     this.emit('seeking');
@@ -112,9 +114,10 @@ export class Clock {
 
   /** Pause, round to a whole frame, and go some frames forward. */
   step(frames: number): void {
+    const count = Math.trunc(finite(frames, 'frames'));
     this.pause();
     const last = this.frameCount - 1;
-    if (last > 0) this.seek(((Math.round((this.#time / this.duration) * last) + frames) / last) * this.duration);
+    if (last > 0) this.seek(((Math.round((this.#time / this.duration) * last) + count) / last) * this.duration);
   }
 
   /** Choose the next faster speed, or with -1 the next slower one. */
