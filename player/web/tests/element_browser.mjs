@@ -179,8 +179,10 @@ scenario('reflects attributes and properties', async () => {
     it.setAttribute('target-fps', '-3');
     it.setAttribute('preload', 'NONE');
     const late = document.createElement('kpc-player');
+    const odd = Object.assign(document.createElement('kpc-player'), { currentTime: '1.5', playbackRate: '2' });
     return {
       html,
+      odd: [odd.currentTime, odd.playbackRate],
       now: [it.quality, it.targetFps, it.preload, it.muted, it.volume, it.shownPart, it.cameraControls],
       fresh: [
         late.duration,
@@ -196,6 +198,7 @@ scenario('reflects attributes and properties', async () => {
   assert.match(got.html, /controls="" loop="" autoplay="" playsinline="" poster="a.jpg" preload="none" quality="fine"/);
   assert.match(got.html, /target-fps="50" part="static" memory="100000000"/);
   assert.deepEqual(got.now, ['auto', 0, 'none', true, 0.5, 'static', true]);
+  assert.deepEqual(got.odd, [1.5, 2]);
   assert.deepEqual(got.fresh, [Number.NaN, 0, 0, true, 0, null, '']);
   assert.deepEqual(await events(page), ['volumechange', 'volumechange']);
   await close(page);

@@ -15,19 +15,31 @@ export function positive(element: HTMLElement, name: string, missing: number): n
   return value > 0 && Number.isFinite(value) ? value : missing;
 }
 
-/** Set an attribute, or take it away: null and false. */
-export function set(element: HTMLElement, name: string, value: string | number | boolean | null): void {
-  if (value === null || value === false) element.removeAttribute(name);
-  else element.setAttribute(name, value === true ? '' : String(value));
+/** Set an attribute, or take it away: null and undefined, by which frameworks say that there is no value. */
+export function set(element: HTMLElement, name: string, value: string | number | null | undefined): void {
+  if (value === null || value === undefined) element.removeAttribute(name);
+  else element.setAttribute(name, String(value));
 }
 
-/** What a page set before the element was defined is set again, now that it has setters. */
+/** Set an attribute that is there or not; any value counts as true or false, as for HTML's own elements. */
+export function setFlag(element: HTMLElement, name: string, value: unknown): void {
+  element.toggleAttribute(name, Boolean(value));
+}
+
+/**
+ * What a page set before the element was defined is set again, now that it has setters. One that is refused must not
+ * keep the scene from being loaded.
+ */
 export function upgrade(element: HTMLElement, names: readonly string[]): void {
   const values = element as unknown as Record<string, unknown>;
   for (const name of names) {
     if (!Object.hasOwn(element, name)) continue;
     const value = values[name];
     delete values[name];
-    values[name] = value;
+    try {
+      values[name] = value;
+    } catch (error) {
+      console.error(`kpc-player: ${(error as Error).message}`);
+    }
   }
 }

@@ -1,6 +1,7 @@
 /** How loud a `<kpc-player>` is, by the properties of HTMLMediaElement. */
 
 import { ReflectedElement } from './reflected_element.js';
+import { finite } from './values.js';
 
 export abstract class AudibleElement extends ReflectedElement {
   #volume = 1;
@@ -11,9 +12,10 @@ export abstract class AudibleElement extends ReflectedElement {
   }
 
   set volume(value: number) {
-    if (!(value >= 0 && value <= 1)) throw new DOMException('volume must be from 0 to 1', 'IndexSizeError');
-    if (value === this.#volume) return;
-    this.#volume = value;
+    const volume = finite(value, 'volume');
+    if (volume < 0 || volume > 1) throw new DOMException('volume must be from 0 to 1', 'IndexSizeError');
+    if (volume === this.#volume) return;
+    this.#volume = volume;
     this.loudnessChanged();
   }
 
@@ -23,8 +25,9 @@ export abstract class AudibleElement extends ReflectedElement {
   }
 
   set muted(value: boolean) {
-    if (value === this.muted) return;
-    this.#muted = value;
+    const isMuted = Boolean(value);
+    if (isMuted === this.muted) return;
+    this.#muted = isMuted;
     this.loudnessChanged();
   }
 

@@ -15,6 +15,7 @@ export type ClockEvent =
 
 /** Speeds to choose from, clip seconds per second. */
 export const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4] as const;
+const MAX_RATE = 16;
 /** Seconds between two timeupdate events while the clip plays. */
 const UPDATE_S = 0.25;
 /** Time does not go on for longer than this at once: a page that was hidden continues where it stopped. */
@@ -63,7 +64,11 @@ export class Clock {
     return this.#rate;
   }
 
-  set rate(rate: number) {
+  set rate(value: number) {
+    const rate = finite(value, 'playbackRate');
+    if (rate <= 0 || rate > MAX_RATE) {
+      throw new DOMException(`playbackRate must be above 0 and at most ${MAX_RATE}`, 'NotSupportedError');
+    }
     if (rate === this.#rate) return;
     this.#rate = rate;
     this.emit('ratechange');

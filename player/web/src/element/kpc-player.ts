@@ -16,6 +16,7 @@ import { PlayPromises } from './play_promises.js';
 import { PlayerCommands } from './player_commands.js';
 import { type PlayerRanges, rangesOf } from './ranges.js';
 import { Session } from './session.js';
+import { finite } from './values.js';
 
 const PROPERTIES = [
   ...['src', 'srcObject', 'poster', 'controls', 'autoplay', 'loop', 'muted', 'playsInline', 'preload', 'currentTime'],
@@ -132,8 +133,8 @@ export class KpcPlayer extends AudibleElement implements Model {
     return this.#session?.clip ? this.#clock.time : (this.#beginning.known ?? 0);
   }
 
-  set currentTime(seconds: number) {
-    if (!Number.isFinite(seconds)) throw new TypeError('currentTime must be a finite number');
+  set currentTime(value: number) {
+    const seconds = finite(value, 'currentTime');
     if (this.#session?.clip) {
       this.#clock.seek(seconds);
       this.#fetch();
@@ -163,8 +164,6 @@ export class KpcPlayer extends AudibleElement implements Model {
   }
 
   set playbackRate(rate: number) {
-    if (!(rate > 0 && rate <= 16))
-      throw new DOMException('playbackRate must be above 0 and at most 16', 'NotSupportedError');
     this.#clock.rate = rate;
   }
 
@@ -271,9 +270,9 @@ export class KpcPlayer extends AudibleElement implements Model {
   }
 
   set keepsLimits(value: boolean) {
-    this.#keepsLimits = value;
+    this.#keepsLimits = Boolean(value);
     const view = this.#session?.view;
-    if (view && view.keepsLimits !== value) view.toggleLimits();
+    if (view && view.keepsLimits !== this.#keepsLimits) view.toggleLimits();
     this.#session?.wake();
   }
 

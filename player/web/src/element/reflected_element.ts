@@ -3,7 +3,7 @@
 import type { ShownPart } from '../render/picture_job.js';
 import { LEVEL_NAMES, type Level } from '../render/quality.js';
 import { DEFAULT_MEMORY } from '../streaming/clip.js';
-import { positive, set, string, word } from './attributes.js';
+import { positive, set, setFlag, string, word } from './attributes.js';
 
 const Base = (globalThis.HTMLElement ?? class {}) as typeof HTMLElement; // servers that render pages have none
 
@@ -30,7 +30,7 @@ export class ReflectedElement extends Base {
   }
 
   set controls(value: boolean) {
-    set(this, 'controls', value);
+    setFlag(this, 'controls', value);
   }
 
   get autoplay(): boolean {
@@ -38,7 +38,7 @@ export class ReflectedElement extends Base {
   }
 
   set autoplay(value: boolean) {
-    set(this, 'autoplay', value);
+    setFlag(this, 'autoplay', value);
   }
 
   get loop(): boolean {
@@ -46,7 +46,7 @@ export class ReflectedElement extends Base {
   }
 
   set loop(value: boolean) {
-    set(this, 'loop', value);
+    setFlag(this, 'loop', value);
   }
 
   get playsInline(): boolean {
@@ -54,7 +54,7 @@ export class ReflectedElement extends Base {
   }
 
   set playsInline(value: boolean) {
-    set(this, 'playsinline', value);
+    setFlag(this, 'playsinline', value);
   }
 
   get preload(): string {

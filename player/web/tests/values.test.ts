@@ -1,0 +1,97 @@
+/** What pages set is converted as for `<video>`; run with an element that has attributes and no page. */
+
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+import { upgrade } from '../src/element/attributes.js';
+import { AudibleElement } from '../src/element/audible_element.js';
+import { Clock } from '../src/element/clock.js';
+
+class Player extends AudibleElement {
+  readonly attributesSet = new Map<string, string>();
+  changes = 0;
+
+  override getAttribute(name: string): string | null {
+    return this.attributesSet.get(name) ?? null;
+  }
+
+  override setAttribute(name: string, value: string): void {
+    this.attributesSet.set(name, value);
+  }
+
+  override hasAttribute(name: string): boolean {
+    return this.attributesSet.has(name);
+  }
+
+  override removeAttribute(name: string): void {
+    this.attributesSet.delete(name);
+  }
+
+  override toggleAttribute(name: string, isThere: boolean): boolean {
+    if (isThere) this.attributesSet.set(name, '');
+    else this.attributesSet.delete(name);
+    return isThere;
+  }
+
+  protected override loudnessChanged(): void {
+    this.changes++;
+  }
+}
+
+test('booleans are true or false whatever is set', () => {
+  for (const name of ['controls', 'autoplay', 'loop', 'playsInline', 'muted', 'cameraControls'] as const) {
+    const player = new Player();
+    for (const value of [undefined, 0, null, '', Number.NaN, false] as unknown as boolean[]) {
+      player[name] = true;
+      player[name] = value;
+      assert.equal(player[name], false, `${name} = ${value}`);
+    }
+    for (const value of ['false', 1, {}, true] as unknown as boolean[]) {
+      player[name] = false;
+      player[name] = value;
+      assert.equal(player[name], true, `${name} = ${value}`);
+    }
+  }
+});
+
+test('texts without a value take the attribute away', () => {
+  const player = new Player();
+  for (const nothing of [null, undefined] as unknown as string[]) {
+    player.poster = 'a.jpg';
+    player.poster = nothing;
+    assert.equal(player.hasAttribute('poster'), false);
+  }
+  player.appearance = 7 as unknown as string;
+  assert.equal(player.appearance, '7');
+});
+
+test('numbers may be texts, and must be finite', () => {
+  const player = new Player();
+  player.volume = '0.5' as unknown as number;
+  assert.equal(player.volume, 0.5);
+  player.volume = null as unknown as number;
+  assert.equal(player.volume, 0);
+  for (const odd of ['x', undefined, Infinity] as unknown as number[]) {
+    assert.throws(() => Object.assign(player, { volume: odd }), TypeError);
+  }
+  for (const odd of [-0.1, 1.1]) {
+    assert.throws(() => Object.assign(player, { volume: odd }), { name: 'IndexSizeError' });
+  }
+  assert.deepEqual([player.volume, player.changes], [0, 2]);
+  const clock = new Clock(() => {});
+  clock.rate = '2' as unknown as number;
+  assert.equal(clock.rate, 2);
+  assert.throws(() => Object.assign(clock, { rate: 'x' }), TypeError);
+  for (const odd of [0, -1, 17])
+    assert.throws(() => Object.assign(clock, { rate: odd }), { name: 'NotSupportedError' });
+  assert.equal(clock.rate, 2);
+});
+
+test('a value that is refused does not keep an element from its other values', (context) => {
+  const logged = context.mock.method(console, 'error', () => {});
+  const player = new Player();
+  Object.defineProperty(player, 'volume', { value: 'x', configurable: true, writable: true });
+  Object.defineProperty(player, 'loop', { value: 1, configurable: true, writable: true });
+  upgrade(player, ['volume', 'loop']);
+  assert.deepEqual([player.volume, player.loop], [1, true]);
+  assert.match(String(logged.mock.calls[0].arguments[0]), /volume must be a finite number/);
+});
