@@ -158,6 +158,14 @@ scenario('knows the viewpoints of the desktop player', async () => {
   await shown(page);
   const value = await player(page, (it) => {
     const views = {};
+    const seen = [];
+    for (const value of [[1, -3, 1, 0, 0, 0, 50], null, ' 1,-3,1,0,0,0,50', undefined, [1, -3, 1, 0, 0, 0, 50], '']) {
+      it.camera = value;
+      seen.push(it.camera);
+    }
+    it.camera = 'opening';
+    const expected = ['1 -3 1 0 0 0 50', it.camera];
+    if (seen.some((view, i) => view !== expected[i % 2])) throw new Error(seen.join('; '));
     for (const name of ['opening', ...it.presets, ...it.cameras]) {
       it.camera = name;
       views[name] = it.camera;

@@ -5,6 +5,7 @@ import { test } from 'node:test';
 import { upgrade } from '../src/element/attributes.js';
 import { AudibleElement } from '../src/element/audible_element.js';
 import { Clock } from '../src/element/clock.js';
+import { cameraText } from '../src/element/values.js';
 
 class Player extends AudibleElement {
   readonly attributesSet = new Map<string, string>();
@@ -94,4 +95,12 @@ test('a value that is refused does not keep an element from its other values', (
   upgrade(player, ['volume', 'loop']);
   assert.deepEqual([player.volume, player.loop], [1, true]);
   assert.match(String(logged.mock.calls[0].arguments[0]), /volume must be a finite number/);
+});
+
+test('a camera is a text, numbers or nothing', () => {
+  assert.equal(cameraText([1, -3, 1, 0, 0, 0]), '1 -3 1 0 0 0');
+  assert.equal(cameraText('1,2,3'), '1,2,3');
+  assert.equal(cameraText(new Float32Array([1, 2])), '1,2');
+  for (const nothing of [null, undefined, '', ' ', []]) assert.equal(cameraText(nothing), 'opening');
+  assert.equal(cameraText(7), '7');
 });

@@ -16,7 +16,7 @@ import { PlayPromises } from './play_promises.js';
 import { PlayerCommands } from './player_commands.js';
 import { type PlayerRanges, rangesOf } from './ranges.js';
 import { Session } from './session.js';
-import { finite } from './values.js';
+import { cameraText, finite } from './values.js';
 
 const PROPERTIES = [
   ...['src', 'srcObject', 'poster', 'controls', 'autoplay', 'loop', 'muted', 'playsInline', 'preload', 'currentTime'],
@@ -231,8 +231,9 @@ export class KpcPlayer extends AudibleElement implements Model {
     return view ? textOfView(view.view) : (this.#beginning.view ?? string(this, 'camera'));
   }
 
-  /** A name of `presets` or `cameras`, "opening", or six or seven numbers. */
-  set camera(text: string) {
+  /** A name of `presets` or `cameras`, "opening", or six or seven numbers, as text or an array. */
+  set camera(value: string | readonly number[] | null | undefined) {
+    const text = cameraText(value);
     const session = this.#session;
     if (!session?.view) {
       this.#beginning.view = text;

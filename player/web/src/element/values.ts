@@ -6,3 +6,12 @@ export function finite(value: unknown, name: string): number {
   if (!Number.isFinite(number)) throw new TypeError(`${name} must be a finite number`);
   return number;
 }
+
+/**
+ * Return what the property `camera` is set to as text. Frameworks bind arrays of numbers; null, undefined and an empty
+ * text mean what no attribute means.
+ */
+export function cameraText(value: unknown): string {
+  const text = Array.isArray(value) ? value.join(' ') : String(value ?? '');
+  return text.trim() === '' ? 'opening' : text;
+}
