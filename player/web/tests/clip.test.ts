@@ -397,10 +397,12 @@ test('what cannot be opened says why', async () => {
   const trailing = new Uint8Array(SAMPLE.length + 1);
   trailing.set(SAMPLE);
   await assert.rejects(open(trailing), hasCode('invalid', '1 bytes follow'));
-  await assert.rejects(
-    withClip('no address', {}, async () => {}),
-    hasCode('not-found'),
-  );
+  for (const text of ['no address', '', 'http://[', 'https://h:99999/x.kpc']) {
+    await assert.rejects(
+      withClip(text, {}, async () => {}),
+      hasCode('not-found', 'is no address'),
+    );
+  }
   const control = new AbortController();
   control.abort();
   await withServer(SAMPLE, {}, async (server) => {

@@ -549,6 +549,18 @@ for (const [src, [code, words]] of Object.entries(WRONG)) {
     assert.ok((await events(page)).includes('error'));
     await inside(page, '.error button').click({ trial: true, timeout: 5000 }); // nothing lies above it
     if (code === 'not-found') {
+      for (const odd of ['http://[', 'https://h:99999/x.kpc', '']) {
+        const loading = await player(
+          page,
+          (it, odd) => {
+            it.src = odd;
+            return [it.src, it.error];
+          },
+          odd,
+        );
+        assert.deepEqual(loading, [odd, null]);
+        await until(page, (it) => it.error?.code === 'not-found' && / is no address$/.test(it.error.detail));
+      }
       await player(page, (it) => {
         it.src = 'scene.kpc';
       });

@@ -317,7 +317,7 @@ export class KpcPlayer extends AudibleElement implements Model {
   /** Open what `src` names; with preload="none" only if `isAsked`. */
   #start(isAsked = false): void {
     const src = this.#file ?? this.src;
-    if (src === '' || !this.isConnected) return;
+    if ((src === '' && !this.hasAttribute('src')) || !this.isConnected) return;
     const mayPlay = this.autoplay && !isReducedMotion();
     if (this.preload === 'none' && !mayPlay && !isAsked) return;
     this.#clock.loop = this.loop;

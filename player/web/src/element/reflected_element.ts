@@ -2,6 +2,7 @@
 
 import type { ShownPart } from '../render/picture_job.js';
 import { LEVEL_NAMES, type Level } from '../render/quality.js';
+import { addressOf } from '../streaming/address.js';
 import { DEFAULT_MEMORY } from '../streaming/clip.js';
 import { positive, set, setFlag, string, word } from './attributes.js';
 
@@ -9,8 +10,9 @@ const Base = (globalThis.HTMLElement ?? class {}) as typeof HTMLElement; // serv
 
 export class ReflectedElement extends Base {
   get src(): string {
-    const value = this.getAttribute('src');
-    return value === null ? '' : new URL(value, document.baseURI).href;
+    const value = string(this, 'src');
+    // The text of what is no address, as for <video>: loading then says that there is no such file.
+    return addressOf(value)?.href ?? value;
   }
 
   set src(value: string) {

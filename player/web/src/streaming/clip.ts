@@ -12,6 +12,7 @@ import type { Camera, SceneHead } from '../container/scene_chunks.js';
 import { sharedPlanes } from '../container/shared_planes.js';
 import { groupChunks, groupSpans, type Part, Timeline } from '../container/timeline.js';
 import { DecoderPool, type PoolOptions } from '../decoder/pool.js';
+import { addressOf } from './address.js';
 import { type HttpOptions, HttpSource } from './http.js';
 import { openContainer } from './opening.js';
 import type { Playhead } from './prefetch.js';
@@ -441,12 +442,8 @@ export class Clip extends EventTarget {
 async function sourceOf(src: string | URL | Blob | ArrayBuffer, options: HttpOptions): Promise<Source> {
   if (src instanceof Blob) return new BlobSource(src);
   if (src instanceof ArrayBuffer) return new BytesSource(new Uint8Array(src));
-  let url: URL;
-  try {
-    url = new URL(src, globalThis.document?.baseURI);
-  } catch {
-    throw new KpcError(`${String(src).slice(0, 200)} is no address`, 'not-found');
-  }
+  const url = addressOf(src);
+  if (url === null) throw new KpcError(`${String(src).slice(0, 200) || 'an empty text'} is no address`, 'not-found');
   return HttpSource.open(url.href, options);
 }
 
