@@ -2,7 +2,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 import { KpcError } from '../src/container/errors.js';
 import { Beginning } from '../src/element/beginning.js';
-import { Clock } from '../src/element/clock.js';
+import { Clock, nextSpeed } from '../src/element/clock.js';
 import { clockText } from '../src/element/controls/timeline.js';
 import { actionOf, flightOf, KEY_BINDINGS } from '../src/element/keyboard.js';
 import { linkTo, momentOf } from '../src/element/link.js';
@@ -78,10 +78,7 @@ test('steps go to whole frames, and speeds through a list', () => {
   clock.seek(0.52);
   clock.step(1);
   assert.ok(Math.abs(clock.time - 0.6) < 1e-9);
-  clock.changeSpeed(1);
-  assert.equal(clock.rate, 2);
-  for (let i = 0; i < 9; i++) clock.changeSpeed(-1);
-  assert.equal(clock.rate, 0.1);
+  assert.deepEqual([nextSpeed(1, 1), nextSpeed(1.4, 1), nextSpeed(0.25, -1), nextSpeed(0.1, -1)], [2, 2, 0.1, 0.1]);
 });
 
 test('times and steps that are no finite numbers are refused', () => {
@@ -144,6 +141,13 @@ test('keys go by letter, or by place where there are other letters', () => {
   assert.deepEqual(flightOf({ key: 'z', code: 'KeyW' }), [0, 0, 1]); // AZERTY
   assert.equal(flightOf({ key: ',', code: 'KeyW' }), null); // Dvorak: slower
   assert.deepEqual(flightOf({ key: 'w', code: 'Comma' }), [0, 0, 1]);
+});
+
+test('keys that move the view do nothing where hands may not, and all others work', () => {
+  const letters = 'rnbx'.split('');
+  for (const key of KEY_BINDINGS.flatMap(({ actions }) => Object.keys(actions))) {
+    assert.equal(actionOf({ key, code: '' }, false), letters.includes(key) ? null : actionOf({ key, code: '' }), key);
+  }
 });
 
 test('every kind of error is a sentence', () => {

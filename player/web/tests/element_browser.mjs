@@ -324,6 +324,16 @@ scenario('heeds the keys of the desktop player', async () => {
   assert.equal(await inside(page, '.panel.keys').isVisible(), true);
   await press('Escape');
   assert.equal(await inside(page, '.panel.keys').isVisible(), false);
+  // Where hands may not move the view, all other keys work.
+  await player(page, (it) => it.setAttribute('camera-controls', 'none'));
+  assert.equal(await inside(page, '.stage').getAttribute('aria-label'), 'A corner of a room. H lists all keys.');
+  const still = await player(page, (it) => it.camera);
+  await press('Home', 'ArrowRight', 'l', 'r', 'w', 'h');
+  const kept = await player(page, (it) => [Math.round(12 * it.currentTime), it.loop, it.camera]);
+  assert.deepEqual(kept, [1, false, still]);
+  assert.doesNotMatch(await inside(page, '.panel.keys').textContent(), /orbit|fly|next camera/);
+  await press('Escape', ' ');
+  await until(page, (it) => !it.paused);
   await close(page);
 });
 

@@ -21,6 +21,13 @@ const UPDATE_S = 0.25;
 /** Time does not go on for longer than this at once: a page that was hidden continues where it stopped. */
 const MAX_STEP_S = 0.5;
 
+/** Return the next faster speed of the list, or with -1 the next slower one. */
+export function nextSpeed(rate: number, steps: number): number {
+  const distances = SPEEDS.map((speed) => Math.abs(speed - rate));
+  const nearest = distances.indexOf(Math.min(...distances));
+  return SPEEDS[Math.min(Math.max(nearest + steps, 0), SPEEDS.length - 1)];
+}
+
 export class Clock {
   loop = false;
   /** Whether time stands still although the clip plays, as while its timeline is dragged. */
@@ -123,13 +130,6 @@ export class Clock {
     this.pause();
     const last = this.frameCount - 1;
     if (last > 0) this.seek(((Math.round((this.#time / this.duration) * last) + count) / last) * this.duration);
-  }
-
-  /** Choose the next faster speed, or with -1 the next slower one. */
-  changeSpeed(steps: number): void {
-    const distances = SPEEDS.map((speed) => Math.abs(speed - this.#rate));
-    const nearest = distances.indexOf(Math.min(...distances));
-    this.rate = SPEEDS[Math.min(Math.max(nearest + steps, 0), SPEEDS.length - 1)];
   }
 
   /** Let time pass, if what is to be shown is there: `canShow` says so of a time. */

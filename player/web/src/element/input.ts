@@ -22,6 +22,8 @@ export interface InputOptions {
   extent(): number;
   /** Whether hands may move the view. */
   isEnabled(): boolean;
+  /** Whether keys that do not move the view are heard. */
+  hearsKeys(): boolean;
   /** Whether the wheel belongs to the player, not to the page. */
   takesWheel(): boolean;
   /** Something has changed that is to be drawn. */
@@ -143,12 +145,13 @@ export class Input {
 
   readonly #key = (event: KeyboardEvent): void => {
     const target = event.composedPath()[0];
-    if (event.ctrlKey || event.altKey || event.metaKey || event.defaultPrevented || !this.#options.isEnabled()) return;
+    if (event.ctrlKey || event.altKey || event.metaKey || event.defaultPrevented || !this.#options.hearsKeys()) return;
     if (target instanceof HTMLSelectElement || (target instanceof HTMLInputElement && target.type === 'text')) return;
     if (event.key === ' ' && (target instanceof HTMLButtonElement || target instanceof HTMLInputElement)) return;
     this.#isFast = event.shiftKey;
-    const flight = flightOf(event);
-    const action = actionOf(event);
+    const isMovable = this.#options.isEnabled();
+    const flight = isMovable ? flightOf(event) : null;
+    const action = actionOf(event, isMovable);
     if (flight) this.#flying.set(event.code, flight);
     else if (action) action(this.#options.commands);
     else return;

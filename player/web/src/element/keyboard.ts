@@ -6,15 +6,17 @@ export interface KeyBinding {
   /** The keys, as people read them on a US keyboard. */
   keys: string;
   help: string;
+  /** Whether it moves the view, so that it does nothing where hands may not. */
+  movesView?: boolean;
   /** By the value of `KeyboardEvent.key`, letters small; empty for what `Input` handles while it is held. */
   actions: Readonly<Record<string, (commands: Commands) => void>>;
 }
 
 export const KEY_BINDINGS: readonly KeyBinding[] = [
-  { keys: 'Drag', help: 'orbit around the scene', actions: {} },
-  { keys: 'Right drag, Shift+drag', help: 'pan', actions: {} },
-  { keys: 'Wheel', help: 'zoom', actions: {} },
-  { keys: 'W A S D, Q E', help: 'fly; four times as fast with Shift', actions: {} },
+  { keys: 'Drag', help: 'orbit around the scene', movesView: true, actions: {} },
+  { keys: 'Right drag, Shift+drag', help: 'pan', movesView: true, actions: {} },
+  { keys: 'Wheel', help: 'zoom', movesView: true, actions: {} },
+  { keys: 'W A S D, Q E', help: 'fly; four times as fast with Shift', movesView: true, actions: {} },
   { keys: 'Space', help: 'play or pause', actions: { ' ': (do_) => do_.playOrPause() } },
   {
     keys: 'Left, Right',
@@ -38,12 +40,18 @@ export const KEY_BINDINGS: readonly KeyBinding[] = [
   },
   { keys: 'L', help: 'loop on or off', actions: { l: (do_) => do_.toggleLoop() } },
   { keys: 'M', help: 'sound off or on', actions: { m: (do_) => do_.toggleSound() } },
-  { keys: 'R', help: 'back to the view that the file opens with', actions: { r: (do_) => do_.toOpening() } },
-  { keys: 'N', help: 'next camera of the scene', actions: { n: (do_) => do_.nextCamera() } },
-  { keys: 'B', help: 'next viewpoint', actions: { b: (do_) => do_.nextPreset() } },
+  {
+    keys: 'R',
+    help: 'back to the view that the file opens with',
+    movesView: true,
+    actions: { r: (do_) => do_.toOpening() },
+  },
+  { keys: 'N', help: 'next camera of the scene', movesView: true, actions: { n: (do_) => do_.nextCamera() } },
+  { keys: 'B', help: 'next viewpoint', movesView: true, actions: { b: (do_) => do_.nextPreset() } },
   {
     keys: 'X',
     help: 'leave or keep the limits from where the scene holds',
+    movesView: true,
     actions: { x: (do_) => do_.toggleLimits() },
   },
   { keys: 'V', help: 'next appearance, if the scene has several', actions: { v: (do_) => do_.nextAppearance() } },
@@ -64,7 +72,10 @@ export const KEY_BINDINGS: readonly KeyBinding[] = [
   { keys: 'H', help: 'show this list', actions: { h: (do_) => do_.toggleHelp() } },
 ];
 
-const ACTIONS = Object.assign({}, ...KEY_BINDINGS.map(({ actions }) => actions)) as KeyBinding['actions'];
+const actionsOf = (bindings: readonly KeyBinding[]): KeyBinding['actions'] =>
+  Object.assign({}, ...bindings.map(({ actions }) => actions));
+const ACTIONS = actionsOf(KEY_BINDINGS);
+const WITHOUT_VIEW = actionsOf(KEY_BINDINGS.filter(({ movesView }) => !movesView));
 
 /** Flying: right, up and forward, by place on a US keyboard. */
 const FLYING: Readonly<Record<string, readonly [number, number, number]>> = {
@@ -82,10 +93,14 @@ export interface KeyPress {
   code: string;
 }
 
-/** Return what a key does; null if nothing. Keys without Latin letters go by their place. */
-export function actionOf({ key, code }: KeyPress): ((commands: Commands) => void) | null {
+/**
+ * Return what a key does; null if nothing, as those that move the view if hands may not. Keys without Latin letters go
+ * by their place.
+ */
+export function actionOf({ key, code }: KeyPress, isMovable = true): ((commands: Commands) => void) | null {
+  const actions = isMovable ? ACTIONS : WITHOUT_VIEW;
   const letter = /^[^\u0000-\u024f]$/u.test(key) ? letterOf(code) : key.length === 1 ? key.toLowerCase() : key;
-  return Object.hasOwn(ACTIONS, letter) ? ACTIONS[letter] : null;
+  return Object.hasOwn(actions, letter) ? actions[letter] : null;
 }
 
 /**

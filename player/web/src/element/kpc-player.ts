@@ -67,6 +67,7 @@ export class KpcPlayer extends AudibleElement implements Model {
       view: () => this.#session?.view ?? null,
       extent: () => this.#session?.extent ?? 1,
       isEnabled: () => this.cameraControls,
+      hearsKeys: () => this.controls || this.cameraControls,
       takesWheel: () => this.#scroll.isNone || this.shadowRoot?.activeElement !== null,
       moved: () => {
         this.#ui.endHint();
@@ -79,7 +80,6 @@ export class KpcPlayer extends AudibleElement implements Model {
       this.#ui.player.addEventListener(gesture, () => this.#session?.sound?.unlock(), { capture: true });
     }
     this.#fullscreen = new Fullscreen(this, () => this.#refresh());
-    this.#ui.setTitle('');
   }
 
   connectedCallback(): void {
@@ -216,11 +216,6 @@ export class KpcPlayer extends AudibleElement implements Model {
   step(frames: number): void {
     this.#clock.step(frames);
     this.#fetch();
-  }
-
-  /** Choose the next faster speed of the list, or with -1 the next slower one. */
-  changeSpeed(steps: number): void {
-    this.#clock.changeSpeed(steps);
   }
 
   // --- looking

@@ -1,6 +1,7 @@
 /** The commands of keys and buttons, done by the element's own properties and methods. */
 
 import { LEVEL_NAMES } from '../render/quality.js';
+import { nextSpeed } from './clock.js';
 import type { Commands } from './commands.js';
 import { make } from './controls/dom.js';
 import type { Ui } from './controls/ui.js';
@@ -35,7 +36,7 @@ export class PlayerCommands implements Commands {
   }
 
   changeSpeed(steps: number): void {
-    this.#player.changeSpeed(steps);
+    this.#player.playbackRate = nextSpeed(this.#player.playbackRate, steps);
     this.#ui().notify(`Speed ${this.#player.playbackRate}×`);
   }
 

@@ -88,9 +88,9 @@ export function fillSettings(panel: HTMLElement, model: Model, commands: Command
   panel.replaceChildren(...rows, buttons);
 }
 
-/** Return the list of keys. */
-export function keyList(): HTMLElement {
-  const rows = KEY_BINDINGS.map(({ keys, help }) =>
+/** Return the list of keys that do something. */
+export function keyList(isMovable: boolean): HTMLElement {
+  const rows = KEY_BINDINGS.filter(({ movesView }) => isMovable || !movesView).map(({ keys, help }) =>
     make('tr', {}, make('th', { scope: 'row' }, keys), make('td', {}, help)),
   );
   return make('table', {}, make('tbody', {}, ...rows));

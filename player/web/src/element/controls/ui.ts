@@ -11,6 +11,7 @@ import { clockText, Timeline } from './timeline.js';
 
 /** Milliseconds for which messages are shown, and after which the bar of a playing clip hides. */
 const [NOTICE_MS, HINT_MS, IDLE_MS] = [4000, 5000, 2500];
+const NO_TITLE = '4D scene';
 /** Clips shorter than this, in seconds, show tenths. */
 const TENTHS_BELOW_S = 20;
 
@@ -74,6 +75,8 @@ export class Ui {
   #hintTimer = 0;
   #idleTimer = 0;
   #isPlaying = false;
+  #isMovable = false;
+  #title = NO_TITLE;
 
   constructor(root: ShadowRoot, model: Model, actions: UiActions) {
     const { commands } = actions;
@@ -127,13 +130,23 @@ export class Ui {
   }
 
   setTitle(title: string): void {
-    this.stage.ariaLabel = `${title || '4D scene'}. Drag, or press W A S D, to look around; H lists all keys.`;
+    this.#title = title || NO_TITLE;
+  }
+
+  /** Name the stage, and say what hands can do there. */
+  #describe(hasControls: boolean): void {
+    const moving = this.#isMovable ? 'Drag, or press W A S D, to look around; ' : '';
+    const keys = this.#isMovable || hasControls ? `${moving}H lists all keys.` : '';
+    const label = `${this.#title}. ${keys}`.trim();
+    if (this.stage.ariaLabel !== label) this.stage.ariaLabel = label;
   }
 
   update(state: UiState): void {
     const { hasControls, isMovable, isShown, isWaiting, paused, ended, isFullscreen, isWhole } = state;
     // Of no use beside an error, over whose button it may lie; but it has the button that leaves the full screen.
     this.#bar.hidden = !hasControls || !(this.#error.hidden || isFullscreen);
+    this.#isMovable = isMovable;
+    this.#describe(hasControls);
     this.stage.classList.toggle('movable', isMovable && isShown);
     this.stage.classList.toggle('whole', isWhole);
     this.stage.tabIndex = isMovable || hasControls ? 0 : -1;
@@ -192,14 +205,8 @@ export class Ui {
     const isOpen = !this.#keys.hidden;
     this.closePanels();
     if (isOpen) return;
-    if (this.#keys.childElementCount === 0) {
-      const close = make(
-        'button',
-        { type: 'button', class: 'choice wide', onclick: () => this.closePanels() },
-        'Close',
-      );
-      this.#keys.append(keyList(), make('div', { class: 'choices' }, close));
-    }
+    const close = make('button', { type: 'button', class: 'choice wide', onclick: () => this.closePanels() }, 'Close');
+    this.#keys.replaceChildren(keyList(this.#isMovable), make('div', { class: 'choices' }, close));
     this.#keys.hidden = false;
     this.#keys.focus();
   }
