@@ -324,6 +324,29 @@ scenario('heeds the keys of the desktop player', async () => {
   assert.equal(await inside(page, '.panel.keys').isVisible(), true);
   await press('Escape');
   assert.equal(await inside(page, '.panel.keys').isVisible(), false);
+  // Open settings show what keys and scripts change, and a click sets what it shows.
+  await player(page, (it) => {
+    it.playbackRate = 1.5;
+  });
+  await button(page, 'Settings').click();
+  const settings = () =>
+    inside(page, '.panel:not([hidden])').evaluate((panel) =>
+      [...panel.querySelectorAll('select, input')].map((it) => (it.type === 'checkbox' ? it.checked : it.value)),
+    );
+  assert.deepEqual(await settings(), ['1.5', 'fastest', 'static', true, true]);
+  await inside(page, '.stage').focus();
+  await press('l', 'x', '=', 'c', ']');
+  await page.waitForTimeout(100);
+  assert.deepEqual(await settings(), ['2', 'faster', 'dynamic', false, false]);
+  const loops = inside(page, '.panel:not([hidden]) label').filter({ hasText: 'Loop' }).locator('input');
+  await loops.evaluate((it) => it.click());
+  assert.deepEqual([await player(page, (it) => it.loop), await loops.isChecked()], [true, true]);
+  await player(page, (it) => Object.assign(it, { playbackRate: 3, loop: 0, quality: 'fastest', keepsLimits: true }));
+  await page.waitForTimeout(100);
+  assert.deepEqual(await settings(), ['3', 'fastest', 'dynamic', false, true]);
+  await player(page, (it) => Object.assign(it, { loop: true }));
+  await inside(page, '.stage').focus();
+  await press('Escape');
   // Where hands may not move the view, all other keys work.
   await player(page, (it) => it.setAttribute('camera-controls', 'none'));
   assert.equal(await inside(page, '.stage').getAttribute('aria-label'), 'A corner of a room. H lists all keys.');

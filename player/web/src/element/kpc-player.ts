@@ -415,6 +415,7 @@ export class KpcPlayer extends AudibleElement implements Model {
     if (event === 'pause')
       this.#plays.settle(this.duration === 0 ? undefined : new DOMException('paused', 'AbortError'));
     this.#emit(event);
+    if (event === 'ratechange') this.#refresh();
   }
 
   protected override loudnessChanged(): void {

@@ -24,6 +24,12 @@ export interface Model {
   loop: boolean;
 }
 
+/** A setting: what shows it, and what makes that show how it is now. */
+interface Row {
+  element: HTMLElement;
+  follow(): void;
+}
+
 const PARTS = { all: 'Everything', static: 'What stands still', dynamic: 'What moves' };
 
 export function fillViews(panel: HTMLElement, model: Model, commands: Commands): void {
@@ -41,51 +47,37 @@ export function fillViews(panel: HTMLElement, model: Model, commands: Commands):
   panel.replaceChildren(make('div', { class: 'choices' }, opening, ...buttons));
   if (model.cameras.length > 1) {
     const options = Object.fromEntries([['', 'Choose'], ...model.cameras.map((name) => [name, name])]);
-    panel.append(select('Camera', options, '', (name) => name !== '' && choose(name)()));
+    const list = select(options, (name) => name !== '' && choose(name)());
+    panel.append(labelled('Camera', list));
   }
 }
 
-export function fillSettings(panel: HTMLElement, model: Model, commands: Commands): void {
-  const rows: HTMLElement[] = [];
-  if (model.duration > 0) {
-    const speeds = Object.fromEntries(SPEEDS.map((speed) => [speed, speed === 1 ? 'Normal' : `${speed}×`]));
-    const ordered = new Map(SPEEDS.map((speed) => [String(speed), speeds[speed]]));
-    rows.push(
-      select('Speed', ordered, String(model.playbackRate), (value) => {
-        model.playbackRate = Number(value);
-      }),
-    );
-  }
+/** Fill the panel of settings; return what makes it show how they are now, however they were changed. */
+export function fillSettings(panel: HTMLElement, model: Model, commands: Commands): () => void {
+  const rows: Row[] = [];
+  const speeds = new Map(SPEEDS.map((speed) => [String(speed), speedText(speed)]));
   const levels = new Map(['auto', ...LEVEL_NAMES].map((level) => [level, capital(level)]));
-  rows.push(
-    select('Quality', levels, model.quality, (value) => {
-      model.quality = value;
-    }),
-  );
-  if (model.isDynamic) {
-    rows.push(
-      select('Show', PARTS, model.shownPart, (value) => {
-        model.shownPart = value;
-      }),
-    );
+  const names = new Map([['', 'Average'], ...model.appearances.map((name) => [name, name] as [string, string])]);
+  if (model.duration > 0) rows.push(speedRow(speeds, model));
+  rows.push(choiceRow('Quality', levels, model, 'quality'));
+  if (model.isDynamic) rows.push(choiceRow('Show', PARTS, model, 'shownPart'));
+  if (model.appearances.length > 0) rows.push(choiceRow('Appearance', names, model, 'appearance'));
+  if (model.duration > 0) rows.push(switchRow('Loop', model, 'loop', () => commands.toggleLoop()));
+  if (model.hasLimits) {
+    rows.push(switchRow('Keep to filmed views', model, 'keepsLimits', () => commands.toggleLimits()));
   }
-  if (model.appearances.length > 0) {
-    const names = new Map([['', 'Average'], ...model.appearances.map((name) => [name, name] as [string, string])]);
-    rows.push(
-      select('Appearance', names, model.appearance, (value) => {
-        model.appearance = value;
-      }),
-    );
-  }
-  if (model.duration > 0) rows.push(check('Loop', model.loop, () => commands.toggleLoop()));
-  if (model.hasLimits) rows.push(check('Keep to filmed views', model.keepsLimits, () => commands.toggleLimits()));
   const buttons = make('div', { class: 'choices' });
   buttons.append(
     make('button', { type: 'button', class: 'choice', onclick: () => commands.savePicture() }, 'Save picture'),
     make('button', { type: 'button', class: 'choice', onclick: () => commands.copyLink() }, 'Copy link'),
     make('button', { type: 'button', class: 'choice wide keyboard', onclick: () => commands.toggleHelp() }, 'Keys'),
   );
-  panel.replaceChildren(...rows, buttons);
+  panel.replaceChildren(...rows.map(({ element }) => element), buttons);
+  const follow = () => {
+    for (const row of rows) row.follow();
+  };
+  follow();
+  return follow;
 }
 
 /** Return the list of keys that do something. */
@@ -96,23 +88,66 @@ export function keyList(isMovable: boolean): HTMLElement {
   return make('table', {}, make('tbody', {}, ...rows));
 }
 
-function select(
+function choiceRow(
   label: string,
   options: Map<string, string> | Record<string, string>,
-  value: string,
+  model: Model,
+  name: 'quality' | 'shownPart' | 'appearance',
+): Row {
+  const list = select(options, (value) => {
+    model[name] = value;
+  });
+  const follow = () => {
+    if (list.value !== model[name]) list.value = model[name];
+  };
+  return { element: labelled(label, list), follow };
+}
+
+/** Speeds of the list and, in its place among them, any other that a page has set. */
+function speedRow(speeds: Map<string, string>, model: Model): Row {
+  const list = select(speeds, (value) => {
+    model.playbackRate = Number(value);
+  });
+  const follow = () => {
+    const rate = model.playbackRate;
+    if (list.value === String(rate)) return;
+    const known = [...list.options];
+    for (const option of known) if (!speeds.has(option.value)) option.remove();
+    if (!speeds.has(String(rate))) {
+      const faster = known.find(({ value }) => speeds.has(value) && Number(value) > rate) ?? null;
+      list.insertBefore(make('option', { value: rate }, speedText(rate)), faster);
+    }
+    list.value = String(rate);
+  };
+  return { element: labelled('Speed', list), follow };
+}
+
+/** A switch: a click sets what it then shows. */
+function switchRow(label: string, model: Model, name: 'loop' | 'keepsLimits', toggle: () => void): Row {
+  const box = make('input', {
+    type: 'checkbox',
+    role: 'switch',
+    onchange: () => box.checked !== model[name] && toggle(),
+  });
+  const follow = () => {
+    if (box.checked !== model[name]) box.checked = model[name];
+  };
+  return { element: labelled(label, box), follow };
+}
+
+function select(
+  options: Map<string, string> | Record<string, string>,
   chosen: (value: string) => void,
-): HTMLElement {
+): HTMLSelectElement {
   const entries = options instanceof Map ? [...options] : Object.entries(options);
   const list = make('select', { onchange: () => chosen(list.value) });
   for (const [name, text] of entries) list.append(make('option', { value: name }, text));
-  list.value = value;
-  return make('label', { class: 'row' }, make('span', {}, label), list);
+  return list;
 }
 
-function check(label: string, isOn: boolean, changed: () => void): HTMLElement {
-  const box = make('input', { type: 'checkbox', role: 'switch', onchange: changed });
-  box.checked = isOn;
-  return make('label', { class: 'row' }, make('span', {}, label), box);
-}
+const labelled = (label: string, element: HTMLElement): HTMLElement =>
+  make('label', { class: 'row' }, make('span', {}, label), element);
+
+const speedText = (speed: number): string => (speed === 1 ? 'Normal' : `${speed}×`);
 
 const capital = (word: string): string => word.charAt(0).toUpperCase() + word.slice(1);

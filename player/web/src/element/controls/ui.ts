@@ -74,6 +74,8 @@ export class Ui {
   #noticeTimer = 0;
   #hintTimer = 0;
   #idleTimer = 0;
+  /** Makes the settings show how they are now. */
+  #followSettings = (): void => {};
   #isPlaying = false;
   #isMovable = false;
   #title = NO_TITLE;
@@ -90,7 +92,11 @@ export class Ui {
     this.#sound = new SoundControls(() => commands.toggleSound(), actions.setVolume);
     this.#popups = [
       new Popup('view', 'Views', (panel) => this.#opening(panel, () => fillViews(panel, model, commands))),
-      new Popup('settings', 'Settings', (panel) => this.#opening(panel, () => fillSettings(panel, model, commands))),
+      new Popup('settings', 'Settings', (panel) =>
+        this.#opening(panel, () => {
+          this.#followSettings = fillSettings(panel, model, commands);
+        }),
+      ),
     ];
     const [views, settings] = this.#popups;
     const link = new IconButton('link', 'Copy link here and now', () => commands.copyLink(), {
@@ -165,6 +171,7 @@ export class Ui {
     if (this.#time.textContent !== text) this.#time.textContent = text;
     this.#timeline.update(state);
     this.#sound.update(state);
+    if (this.#popups[1].isOpen) this.#followSettings();
     if (this.#isPlaying === paused) {
       this.#isPlaying = !paused;
       this.#stirred();
