@@ -69,8 +69,33 @@ test('seeking ends once the picture is there', () => {
   clock.tick(0.1, () => false);
   assert.equal(take(), 'seeking');
   clock.tick(0.1, always);
-  assert.equal(take(), 'timeupdate seeked');
+  assert.equal(take(), 'timeupdate seeked ended');
   assert.equal(clock.time, 2);
+});
+
+test('a clip that is at its end has ended, however it came there', () => {
+  const { clock, take } = clockOf();
+  clock.seek(2);
+  clock.tick(0.1, always);
+  assert.deepEqual([clock.ended, clock.paused, clock.speed], [true, true, 0]);
+  clock.loop = true;
+  assert.equal(clock.ended, false);
+  clock.loop = false;
+  take();
+  clock.play();
+  for (let i = 0; i < 3; i++) clock.tick(0.1, always);
+  assert.equal(take(), 'seeking play timeupdate seeked playing');
+  assert.ok(clock.time < 1 && !clock.ended && !clock.paused);
+  clock.seek(2); // while it plays, as by a hand on the timeline
+  clock.tick(0.1, always);
+  assert.deepEqual(
+    [clock.ended, clock.paused, take()],
+    [true, true, 'seeking timeupdate seeked timeupdate pause ended'],
+  );
+  clock.begin(1);
+  assert.equal(clock.ended, false);
+  const still = clockOf(0, 1).clock;
+  assert.equal(still.ended, false);
 });
 
 test('steps go to whole frames, and speeds through a list', () => {

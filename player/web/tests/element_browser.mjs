@@ -307,6 +307,11 @@ scenario('heeds the keys of the desktop player', async () => {
   assert.ok(Math.abs((await player(page, (it) => it.currentTime)) - 2 / 12) < 1e-6);
   await press('End');
   assert.equal(await player(page, (it) => it.currentTime), 29 / 12);
+  assert.equal(await player(page, (it) => it.ended), true);
+  await button(page, 'Play again').waitFor();
+  await press(' ');
+  await until(page, (it) => !it.paused && it.currentTime > 0 && it.currentTime < 2);
+  await press(' ');
   await press('Home', ']', 'l', 'c', '-');
   const state = await player(page, (it) => [it.currentTime, it.playbackRate, it.loop, it.shownPart, it.quality]);
   assert.deepEqual(state, [0, 2, true, 'static', 'fastest']);

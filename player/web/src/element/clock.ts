@@ -38,7 +38,6 @@ export class Clock {
   #time = 0;
   #rate = 1;
   #paused = true;
-  #ended = false;
   #isSeeking = false;
   #isWaiting = false;
   #sinceUpdate = 0;
@@ -54,8 +53,9 @@ export class Clock {
     return this.#paused;
   }
 
+  /** Whether it is at its end, however it came there, and does not go on from there. */
   get ended(): boolean {
-    return this.#ended;
+    return this.duration > 0 && this.#time >= this.duration && !this.loop;
   }
 
   get isSeeking(): boolean {
@@ -83,7 +83,7 @@ export class Clock {
 
   /** Clip seconds per second at present. */
   get speed(): number {
-    return this.#paused || this.#ended ? 0 : this.#rate;
+    return this.#paused || this.ended ? 0 : this.#rate;
   }
 
   /** Forget the clip, without an event. */
@@ -91,7 +91,7 @@ export class Clock {
     this.#time = this.duration = this.#sinceUpdate = 0;
     this.frameCount = 1;
     this.#paused = true;
-    this.#ended = this.#isSeeking = this.#isWaiting = this.isHeld = false;
+    this.#isSeeking = this.#isWaiting = this.isHeld = false;
   }
 
   /** Begin a clip at a time, without an event. */
@@ -101,7 +101,7 @@ export class Clock {
 
   /** Play; from the start, if the clip has ended. */
   play(): void {
-    if (this.#ended) this.seek(0);
+    if (this.ended) this.seek(0);
     if (!this.#paused) return;
     this.#paused = false;
     this.#isWaiting = true;
@@ -119,7 +119,6 @@ export class Clock {
   /** Go to a time, clamped to the clip. */
   seek(time: number): void {
     this.#time = Math.min(Math.max(finite(time, 'currentTime'), 0), this.duration);
-    this.#ended = false;
     this.#isSeeking = true;
     this.emit('seeking');
   }
@@ -139,6 +138,7 @@ export class Clock {
       this.#isSeeking = false;
       this.emit('timeupdate');
       this.emit('seeked');
+      if (this.#paused && this.ended) this.emit('ended');
     }
     if (this.#paused) return;
     if (!isShown) {
@@ -160,7 +160,7 @@ export class Clock {
     this.#time = !isOver ? time : this.loop && this.duration > 0 ? time % this.duration : this.duration;
     this.#sinceUpdate += seconds;
     if (isOver && !this.loop) {
-      this.#ended = this.#paused = true;
+      this.#paused = true;
       for (const event of ['timeupdate', 'pause', 'ended'] as const) this.emit(event);
     } else if (this.#sinceUpdate >= UPDATE_S) {
       this.#sinceUpdate = 0;
