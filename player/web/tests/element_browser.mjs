@@ -334,21 +334,24 @@ scenario('heeds the keys of the desktop player', async () => {
     it.playbackRate = 1.5;
   });
   await button(page, 'Settings').click();
-  const settings = () =>
-    inside(page, '.panel:not([hidden])').evaluate((panel) =>
-      [...panel.querySelectorAll('select, input')].map((it) => (it.type === 'checkbox' ? it.checked : it.value)),
+  const showSettings = (...expected) =>
+    until(
+      page,
+      (it, expected) => {
+        const fields = [...it.shadowRoot.querySelectorAll('.panel:not([hidden]) :is(select, input)')];
+        return fields.map((field) => (field.type === 'checkbox' ? field.checked : field.value)).join() === expected;
+      },
+      expected.join(),
     );
-  assert.deepEqual(await settings(), ['1.5', 'fastest', 'static', true, true]);
+  await showSettings('1.5', 'fastest', 'static', true, true);
   await inside(page, '.stage').focus();
   await press('l', 'x', '=', 'c', ']');
-  await page.waitForTimeout(100);
-  assert.deepEqual(await settings(), ['2', 'faster', 'dynamic', false, false]);
+  await showSettings('2', 'faster', 'dynamic', false, false);
   const loops = inside(page, '.panel:not([hidden]) label').filter({ hasText: 'Loop' }).locator('input');
   await loops.evaluate((it) => it.click());
   assert.deepEqual([await player(page, (it) => it.loop), await loops.isChecked()], [true, true]);
   await player(page, (it) => Object.assign(it, { playbackRate: 3, loop: 0, quality: 'fastest', keepsLimits: true }));
-  await page.waitForTimeout(100);
-  assert.deepEqual(await settings(), ['3', 'fastest', 'dynamic', false, true]);
+  await showSettings('3', 'fastest', 'dynamic', false, true);
   await player(page, (it) => Object.assign(it, { loop: true }));
   await inside(page, '.stage').focus();
   await press('Escape');
@@ -362,6 +365,9 @@ scenario('heeds the keys of the desktop player', async () => {
   assert.doesNotMatch(await inside(page, '.panel.keys').textContent(), /orbit|fly|next camera/);
   await press('Escape', ' ');
   await until(page, (it) => !it.paused);
+  await inside(page, 'input[aria-label="Time"]').focus();
+  await press(' ');
+  assert.equal(await player(page, (it) => it.paused), true);
   await close(page);
 });
 

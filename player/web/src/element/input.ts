@@ -147,7 +147,10 @@ export class Input {
     const target = event.composedPath()[0];
     if (event.ctrlKey || event.altKey || event.metaKey || event.defaultPrevented || !this.#options.hearsKeys()) return;
     if (target instanceof HTMLSelectElement || (target instanceof HTMLInputElement && target.type === 'text')) return;
-    if (event.key === ' ' && (target instanceof HTMLButtonElement || target instanceof HTMLInputElement)) return;
+    // Space presses buttons and switches; on the timeline, where it does nothing else, it plays or pauses.
+    const isPressed =
+      target instanceof HTMLInputElement ? target.type !== 'range' : target instanceof HTMLButtonElement;
+    if (event.key === ' ' && isPressed) return;
     this.#isFast = event.shiftKey;
     const isMovable = this.#options.isEnabled();
     const flight = isMovable ? flightOf(event) : null;
