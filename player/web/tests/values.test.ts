@@ -5,7 +5,7 @@ import { test } from 'node:test';
 import { upgrade } from '../src/element/attributes.js';
 import { AudibleElement } from '../src/element/audible_element.js';
 import { Clock } from '../src/element/clock.js';
-import { cameraText } from '../src/element/values.js';
+import { byteCount, cameraText } from '../src/element/values.js';
 
 class Player extends AudibleElement {
   readonly attributesSet = new Map<string, string>();
@@ -103,4 +103,37 @@ test('a camera is a text, numbers or nothing', () => {
   assert.equal(cameraText(new Float32Array([1, 2])), '1,2');
   for (const nothing of [null, undefined, '', ' ', []]) assert.equal(cameraText(nothing), 'opening');
   assert.equal(cameraText(7), '7');
+});
+
+test('sizes are those of the option --memory', () => {
+  const sizes = {
+    '300000': 3e5,
+    '300KB': 3e5,
+    '2mb': 2e6,
+    '1.5M': 1.5e6,
+    '512 MB': 512e6,
+    '.5GB': 5e8,
+    '1e8': 1e8,
+    ' 7b ': 7,
+  };
+  for (const [text, bytes] of Object.entries(sizes)) assert.equal(byteCount(text), bytes, text);
+  for (const odd of ['', 'MB', '-1', '0', '0x10', '1TB', '1 M B', 'x1', '1e12', '1e999', 'NaN', '512MiB']) {
+    assert.equal(byteCount(odd), null, odd);
+  }
+});
+
+test('a size that is none is refused with one warning', (context) => {
+  const warned = context.mock.method(console, 'warn', () => {});
+  const player = new Player();
+  const { memory } = player;
+  player.memory = '512MB';
+  assert.equal(player.memory, 512e6);
+  for (const odd of ['much', 'much', '-3']) {
+    player.memory = odd;
+    assert.equal(player.memory, memory);
+  }
+  assert.equal(warned.mock.callCount(), 2);
+  assert.match(String(warned.mock.calls[0].arguments[0]), /memory="much" is not a size/);
+  player.memory = null as unknown as number;
+  assert.equal(player.memory, memory);
 });

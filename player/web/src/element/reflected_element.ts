@@ -5,10 +5,14 @@ import { LEVEL_NAMES, type Level } from '../render/quality.js';
 import { addressOf } from '../streaming/address.js';
 import { DEFAULT_MEMORY } from '../streaming/clip.js';
 import { positive, set, setFlag, string, word } from './attributes.js';
+import { byteCount } from './values.js';
 
 const Base = (globalThis.HTMLElement ?? class {}) as typeof HTMLElement; // servers that render pages have none
 
 export class ReflectedElement extends Base {
+  /** A size that was refused, of which the console has been warned. */
+  #warnedOf: string | null = null;
+
   get src(): string {
     const value = string(this, 'src');
     // The text of what is no address, as for <video>: loading then says that there is no such file.
@@ -110,11 +114,19 @@ export class ReflectedElement extends Base {
     set(this, 'appearance', value);
   }
 
+  /** Bytes that the clip may take; the attribute may say them in KB, MB or GB. */
   get memory(): number {
-    return positive(this, 'memory', DEFAULT_MEMORY);
+    const text = this.getAttribute('memory');
+    if (text === null) return DEFAULT_MEMORY;
+    const bytes = byteCount(text);
+    if (bytes === null && text !== this.#warnedOf) {
+      console.warn(`kpc-player: memory="${text}" is not a size; write for example 300MB or 2GB`);
+      this.#warnedOf = text;
+    }
+    return bytes ?? DEFAULT_MEMORY;
   }
 
-  set memory(value: number) {
+  set memory(value: number | string) {
     set(this, 'memory', value);
   }
 }

@@ -15,3 +15,10 @@ export function cameraText(value: unknown): string {
   const text = Array.isArray(value) ? value.join(' ') : String(value ?? '');
   return text.trim() === '' ? 'opening' : text;
 }
+
+/** Return the bytes that a size such as "300000", "300KB" (1 KB = 1,000 bytes), "2MB" or "1.5GB" says; null if none. */
+export function byteCount(text: string): number | null {
+  const [, number, unit] = /^\s*([+]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([KMG]?)B?\s*$/i.exec(text) ?? [];
+  const bytes = Number(number) * 1000 ** ' KMG'.indexOf(unit?.toUpperCase() || ' ');
+  return bytes >= 1 && bytes < 1e12 ? Math.floor(bytes) : null;
+}
