@@ -5,7 +5,7 @@ import { test } from 'node:test';
 import { upgrade } from '../src/element/attributes.js';
 import { AudibleElement } from '../src/element/audible_element.js';
 import { Clock } from '../src/element/clock.js';
-import { byteCount, cameraText } from '../src/element/values.js';
+import { blobOrNull, byteCount, cameraText } from '../src/element/values.js';
 
 class Player extends AudibleElement {
   readonly attributesSet = new Map<string, string>();
@@ -103,6 +103,15 @@ test('a camera is a text, numbers or nothing', () => {
   assert.equal(cameraText(new Float32Array([1, 2])), '1,2');
   for (const nothing of [null, undefined, '', ' ', []]) assert.equal(cameraText(nothing), 'opening');
   assert.equal(cameraText(7), '7');
+});
+
+test('a file is a Blob, or none', () => {
+  const blob = new Blob(['x']);
+  assert.equal(blobOrNull(blob, 'srcObject'), blob);
+  for (const nothing of [null, undefined]) assert.equal(blobOrNull(nothing, 'srcObject'), null);
+  for (const odd of ['text', '', 0, false, {}]) {
+    assert.throws(() => blobOrNull(odd, 'srcObject'), { name: 'TypeError', message: /^srcObject must be a Blob/ });
+  }
 });
 
 test('sizes are those of the option --memory', () => {

@@ -16,7 +16,7 @@ import { PlayPromises } from './play_promises.js';
 import { PlayerCommands } from './player_commands.js';
 import { type PlayerRanges, rangesOf } from './ranges.js';
 import { Session } from './session.js';
-import { cameraText, finite } from './values.js';
+import { blobOrNull, cameraText, finite } from './values.js';
 
 const PROPERTIES = [
   ...['src', 'srcObject', 'poster', 'controls', 'autoplay', 'loop', 'muted', 'playsInline', 'preload', 'currentTime'],
@@ -125,7 +125,7 @@ export class KpcPlayer extends AudibleElement implements Model {
   }
 
   set srcObject(file: Blob | null) {
-    this.#file = file;
+    this.#file = blobOrNull(file, 'srcObject');
     this.#begin();
   }
 

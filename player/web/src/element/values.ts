@@ -7,6 +7,13 @@ export function finite(value: unknown, name: string): number {
   return number;
 }
 
+/** Return a file that the page has, or null for none; throw a TypeError for anything else. */
+export function blobOrNull(value: unknown, name: string): Blob | null {
+  if (value === null || value === undefined) return null;
+  if (!(value instanceof Blob)) throw new TypeError(`${name} must be a Blob, a File or null`);
+  return value;
+}
+
 /**
  * Return what the property `camera` is set to as text. Frameworks bind arrays of numbers; null, undefined and an empty
  * text mean what no attribute means.
