@@ -820,6 +820,13 @@ scenario('shows the poster and loads nothing before it is asked to', async () =>
   await until(page, (it) => it.currentTime > 0.1);
   assert.equal(await inside(page, '.large').isVisible(), false);
   assert.ok(await inside(page, '.poster').evaluate((it) => it.classList.contains('done')));
+  // Another value of preload holds at once.
+  await page.evaluate(async () => {
+    const it = Object.assign(document.createElement('kpc-player'), { preload: 'none', src: 'scene.kpc' });
+    document.body.append(it);
+    it.preload = 'metadata';
+    await new Promise((resolve) => it.addEventListener('loadedmetadata', resolve, { once: true }));
+  });
   await close(page);
 });
 
@@ -833,6 +840,10 @@ scenario('shows a coarse picture or the poster with preload="metadata"', async (
     return { readyState: it.readyState, hasPoster: it.shadowRoot.querySelector('.poster').checkVisibility() };
   });
   assert.deepEqual(other, { readyState: 1, hasPoster: true });
+  await page.evaluate(() => {
+    document.querySelectorAll('kpc-player')[1].preload = 'auto';
+  });
+  await until(page, () => document.querySelectorAll('kpc-player')[1].readyState >= 2);
   assert.ok((await player(page, (it) => it.duration)) > 7);
   assert.equal(await inside(page, '.large').isVisible(), true);
   const read = () =>

@@ -31,7 +31,7 @@ const connected = new Set<KpcPlayer>();
 export class KpcPlayer extends AudibleElement implements Model {
   static readonly observedAttributes = [
     ...['src', 'poster', 'controls', 'loop', 'camera', 'camera-controls', 'quality', 'target-fps', 'part'],
-    ...['appearance', 'autoplay', 'muted'],
+    ...['appearance', 'autoplay', 'muted', 'preload'],
   ];
 
   readonly #clock = new Clock((event) => this.#clocked(event));
@@ -113,6 +113,10 @@ export class KpcPlayer extends AudibleElement implements Model {
     if (name === 'camera' && value !== null) this.camera = value;
     if (name === 'target-fps' && this.#session) this.#session.fps = this.targetFps || undefined;
     if (name === 'muted' && connected.has(this)) this.loudnessChanged();
+    if (name === 'preload' && connected.has(this)) {
+      if (this.#session === null) this.#start();
+      else if (this.preload === 'auto') this.#fetch();
+    }
     if (name === 'autoplay' && this.autoplay && this.#session?.clip) this.#playByItself();
     this.#refresh();
   }
