@@ -191,6 +191,11 @@ test('every kind of error is a sentence', () => {
     playerErrorOf(new KpcError('x', 'blocked'), 'https://a.example/b', 'o').message,
     /^The server a\.example .*Access-Control/,
   );
+  const messageOf = (code: 'blocked' | 'not-found', src: string) =>
+    playerErrorOf(new KpcError('x', code), src, 'https://c.example').message;
+  assert.match(messageOf('blocked', 'file:///home/a.kpc'), /^A page cannot read files of a disk\..*\.$/);
+  assert.match(messageOf('not-found', 'ftp://a.example/b.kpc'), /^A page cannot fetch .* "ftp:"\..*\.$/);
+  assert.match(messageOf('not-found', 'http://['), /^There is no such file/);
   assert.equal(playerErrorOf('odd', '', '').code, 'unknown');
 });
 

@@ -605,6 +605,15 @@ for (const [src, [code, words]] of Object.entries(WRONG)) {
         assert.deepEqual(loading, [odd, null]);
         await until(page, (it) => it.error?.code === 'not-found' && / is no address$/.test(it.error.detail));
       }
+      for (const [odd, sentence] of [
+        ['ftp://a.example/b.kpc', 'A page cannot fetch addresses that begin with "ftp:". Use one'],
+        ['javascript:0', 'A page cannot fetch addresses that begin with "javascript:". Use one'],
+        ['about:blank', 'A page cannot fetch addresses that begin with "about:". Use one'],
+        ['file:///a.kpc', 'A page cannot read files of a disk.'],
+      ]) {
+        await page.evaluate(`document.querySelector('kpc-player').src = ${JSON.stringify(odd)}`);
+        await until(page, (it, sentence) => it.error?.message.startsWith(sentence), sentence);
+      }
       await player(page, (it) => {
         it.src = 'scene.kpc';
       });

@@ -203,6 +203,11 @@ test('says that another site does not permit the page to read', async () => {
     await assert.rejects(open('http://files.example/scene.kpc', false), hasCode('blocked', 'https'));
     await assert.rejects(open('https://files.example/scene.kpc', false), hasCode('network'));
     await assert.rejects(open('https://page.example/scene.kpc', true), hasCode('network'));
+    for (const odd of ['ftp://files.example/scene.kpc', 'about:blank', 'javascript:0', 'c:\\scene.kpc']) {
+      await assert.rejects(open(odd, false), hasCode('not-found', 'cannot fetch such addresses'));
+    }
+    global.location = { origin: 'app://page', href: 'app://page/', protocol: 'app:' };
+    await assert.rejects(open('app://page/scene.kpc', false), hasCode('network'));
     global.location = { origin: 'null', href: 'file:///page.html', protocol: 'file:' };
     await assert.rejects(open('file:///scene.kpc', true), hasCode('blocked', 'kpplay --web'));
   } finally {

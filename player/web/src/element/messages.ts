@@ -1,6 +1,7 @@
 /** What went wrong, in sentences for people who watch. */
 
 import { type ErrorCode, KpcError } from '../container/errors.js';
+import { strangeScheme } from '../streaming/address.js';
 
 export type PlayerErrorCode = ErrorCode | 'unknown';
 
@@ -32,8 +33,11 @@ function codeOf(thrown: unknown): PlayerErrorCode {
 function sentenceOf(code: PlayerErrorCode, detail: string, src: string, origin: string): string {
   switch (code) {
     case 'not-found':
-      return 'There is no such file. The address may have changed.';
+      return strangeScheme(src) === null
+        ? 'There is no such file. The address may have changed.'
+        : `A page cannot fetch addresses that begin with "${strangeScheme(src)}". Use one that begins with "https:".`;
     case 'blocked':
+      if (src.startsWith('file:')) return 'A page cannot read files of a disk. Open the file by kpplay --web instead.';
       return `The server ${hostOf(src)} does not let this page read the file. Its answers need the header Access-Control-Allow-Origin: ${origin}`;
     case 'network':
       return 'The file cannot be fetched. Check the connection, then try again.';

@@ -11,6 +11,7 @@
  */
 
 import { BudgetError, KpcError } from '../container/errors.js';
+import { strangeScheme } from './address.js';
 import { Connection, TemporaryFailure } from './connection.js';
 import { lengthOf, nameOf, rangeOf, retryAfter, validatorOf } from './http_headers.js';
 import { emptyError, type ReadOptions, type Source } from './source.js';
@@ -217,8 +218,12 @@ export class HttpSource implements Source {
     throw new KpcError(`${this.name}: ${answer}; check the address`, code);
   }
 
-  /** Return why the page may not read from this server, if that is why a first request fails; else null. */
+  /** Return why the page cannot read from this address, if that is why a first request fails; else null. */
   async #blockade(): Promise<KpcError | null> {
+    if (strangeScheme(this.#given) !== null) {
+      const reason = 'a page cannot fetch such addresses; write one as https://example.org/scene.kpc';
+      return new KpcError(`${this.name}: ${reason}`, 'not-found');
+    }
     const { location } = globalThis as { location?: Location };
     const url = new URL(this.#given, location?.href);
     if (location === undefined) return null;
