@@ -1,7 +1,7 @@
 """From bare footage to cameras and clocks: what `kpposes` does, and `kpenc` for a folder without poses."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,11 +10,12 @@ import numpy as np
 from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.poses.clocks import UNKNOWN, Clock
 from kpc.encoder.poses.doubts import MATCHED, by_camera, doubts
+from kpc.encoder.poses.false_views import without_false_views
 from kpc.encoder.poses.footage import Footage, find_footage, frame_size
 from kpc.encoder.poses.given_clocks import read_clocks
 from kpc.encoder.poses.instants import Picture, grey_of, moving_pictures, still_pictures
 from kpc.encoder.poses.orientation import extent
-from kpc.encoder.poses.structure import MANY, Pairing, PlacedView, Structure, oriented, reconstruct
+from kpc.encoder.poses.structure import ALL, MANY, Pairing, PlacedView, Structure, oriented, reconstruct
 from kpc.encoder.poses.survey import Survey, frame_count, survey
 from kpc.encoder.poses.sync import SURE, clocks_by_motion, clocks_by_sound, wants_motion
 from kpc.encoder.poses.takes import Take, frame_names, pairing_of, pictures_of, take_of
@@ -155,26 +156,51 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
     if isinstance(sync, str):
         clocks = clocks_by_sound(footage, sync)
         if wants_motion(footage, clocks, sync):
-            still = reconstruct(still_pictures(surveys), names, ways[0], ATTEMPTS[0][0], lenses=ways)
+
+            def place_still(pairing: Pairing) -> Structure:
+                return without_false_views(
+                    reconstruct(still_pictures(surveys), names, ways[0], ATTEMPTS[0][0], pairing, ways), is_rig=True
+                )
+
+            still = _undisturbed(place_still)
             clocks = clocks_by_motion(footage, surveys, clocks, still.views)
         _warn_of_clocks(root, names, clocks)
     else:
         clocks = sync
-    best: Structure | None = None
-    for features, instants in ATTEMPTS:
-        pictures = [*still_pictures(surveys), *moving_pictures(footage, surveys, clocks, instants)]
-        pictures.sort(key=lambda picture: picture.view)
-        structure = reconstruct(pictures, names, ways[0], features, lenses=ways)
-        if best is None or (len(structure.views), -structure.error) > (len(best.views), -best.error):
-            best = structure
-        if len(best.views) == len(footage):
+    best, count = Structure({}, np.zeros((0, 3)), np.zeros((0, 4)), {}), len(footage)
+    for number, (features, instants) in enumerate(ATTEMPTS):
+        if number > 0:
+            notice(f"{root}: {len(best.views)} of {count} cameras placed; trying again with more features")
+
+        def place(pairing: Pairing, features: int = features, instants: int = instants) -> Structure:
+            pictures = [*still_pictures(surveys), *moving_pictures(footage, surveys, clocks, instants)]
+            pictures.sort(key=lambda picture: picture.view)
+            return without_false_views(reconstruct(pictures, names, ways[0], features, pairing, ways), is_rig=True)
+
+        best = max(best, _undisturbed(place), key=_worth)
+        if len(best.views) == count:
             break
-        notice(f"{root}: {len(best.views)} of {len(footage)} cameras placed; trying again with more features")
-    assert best is not None
     if still is not None and len(still.views) > len(best.views):
         best = still
     motion = tuple(seen.motion for seen in surveys)
     return Found("still rig", footage, tuple(clocks), tuple(names), best, False, motion)
+
+
+def _worth(structure: Structure) -> tuple[int, float]:
+    """Return by what one of several models of the same cameras is chosen: the largest."""
+    return len(structure.views), -structure.error
+
+
+def _undisturbed(place: Callable[[Pairing], Structure]) -> Structure:
+    """Place the views; do so once more without those that were dropped, which may have disturbed the others."""
+    first = place(ALL)
+    if not first.dropped or len(first.views) < LEAST_CAMERAS:
+        return first
+    again = place(replace(ALL, without=first.dropped))
+    if len(again.views) < len(first.views):
+        return first
+    dropped = tuple(sorted({*first.dropped, *again.dropped}))
+    return replace(again, pairs=first.pairs | again.pairs, dropped=dropped)
 
 
 def _warn_of_clocks(root: Path, names: Sequence[str], clocks: Sequence[Clock], *, are_moving: bool = False) -> None:
@@ -227,13 +253,15 @@ def _find_moving_cameras(
     count = len(take.names)
     features = FEATURES_OF_LONG if count > LONG else FEATURES_OF_MANY if count > MANY else ATTEMPTS[0][0]
     by_size = _lenses([frame_size(one) for one in footage])
-    structure = reconstruct(
-        pictures_of(footage, surveys, take),
-        take.names,
-        take.cameras,
-        features,
-        pairing_of(take, known),
-        ([by_size[camera] for camera in take.cameras], take.cameras) if len(footage) > 1 else (),
+    structure = without_false_views(
+        reconstruct(
+            pictures_of(footage, surveys, take),
+            take.names,
+            take.cameras,
+            features,
+            pairing_of(take, known),
+            ([by_size[camera] for camera in take.cameras], take.cameras) if len(footage) > 1 else (),
+        )
     )
     kind = "moving cameras" if len(footage) > 1 else "moving camera"
     return Found(kind, footage, tuple(clocks), take.names, structure, False, take=take)
@@ -246,9 +274,10 @@ def _find_photographs(root: Path, footage: tuple[Footage, ...]) -> Found:
 
     sizes = [image_info(one.files[0]).displayed_size for one in footage]
     features = FEATURES_OF_MANY if len(footage) > MANY else ATTEMPTS[0][0]
-    structure = reconstruct(pictures(), [one.name for one in footage], _lenses(sizes), features, PHOTOGRAPHS)
+    names = [one.name for one in footage]
+    structure = without_false_views(reconstruct(pictures(), names, _lenses(sizes), features, PHOTOGRAPHS))
     clocks = (UNKNOWN,) * len(footage)
-    return Found("photographs", footage, clocks, tuple(one.name for one in footage), structure, False)
+    return Found("photographs", footage, clocks, tuple(names), structure, False)
 
 
 def _lenses(sizes: Sequence[tuple[int, ...]]) -> list[int]:
@@ -279,7 +308,10 @@ def _with_neighbours(found: Found, missing: Sequence[int]) -> list[str]:
     said = []
     for number in missing:
         near = [found.view_names[n] for n in _neighbours(found.structure, number)]
-        said.append(f"{found.view_names[number]} ({f'matches only {first_names(near)}' if near else 'matches none'})")
+        why = f"matches only {first_names(near)}" if near else "matches none"
+        if number in found.structure.dropped:
+            why += ", and fits these by too few points"
+        said.append(f"{found.view_names[number]} ({why})")
     return said
 
 

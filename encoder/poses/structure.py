@@ -38,6 +38,7 @@ class Pairing:
         every: these are sought among pictures so many apart.
         by_camera: whether steps lead to views of the same camera only, and so many alike are sought in each camera.
         besides: pairs of views that are matched, too, the first one of the lower number.
+        without: views that are not matched at all.
     """
 
     steps: tuple[int, ...] | None = None
@@ -45,6 +46,7 @@ class Pairing:
     every: int = 1
     by_camera: bool = False
     besides: tuple[tuple[int, int], ...] = ()
+    without: tuple[int, ...] = ()
 
 
 ALL = Pairing()
@@ -93,6 +95,7 @@ class Structure:
         observations: (M, 4) float64: number of the point, of the view, x and y in its picture.
         pairs: how the features of each two views match.
         apart: views that were not placed with these, but with each other.
+        dropped: views that were placed, but see too little of what the others see to be believed.
     """
 
     views: dict[int, PlacedView]
@@ -100,6 +103,7 @@ class Structure:
     observations: np.ndarray
     pairs: dict[tuple[int, int], Pair]
     apart: tuple[int, ...] = ()
+    dropped: tuple[int, ...] = ()
 
     @property
     def error(self) -> float:
@@ -191,6 +195,8 @@ def _pairs(pictures: list[dict], pairing: Pairing, cameras: Sequence[int]) -> li
             first, second = sorted((one["view"], two["view"]))
             near = steps is None or second - first in steps
             near &= not pairing.by_camera or cameras[first] == cameras[second]
+            if first in pairing.without or second in pairing.without:
+                continue
             if one["instant"] == two["instant"] and first != second and (near or (first, second) in besides):
                 found.append((a, b) if one["view"] == first else (b, a))
     return found
@@ -265,7 +271,7 @@ def _read(folder: Path) -> Structure:
             (lens.get("fx", lens.get("f")), lens.get("fy", lens.get("f")), lens["cx"], lens["cy"]),
             (lens.get("k1", lens.get("k", 0.0)), lens.get("k2", 0.0), lens.get("p1", 0.0), lens.get("p2", 0.0)),
             view["points"],
-            view["error"],
+            float("nan") if view["error"] is None else view["error"],  # of a view without points
         )
     empty = np.zeros((0, 3))
     return Structure(
