@@ -165,6 +165,7 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
             still = _undisturbed(place_still)
             clocks = clocks_by_motion(footage, surveys, clocks, still.views)
         _warn_of_clocks(root, names, clocks)
+        _warn_if_none_found(root, footage, clocks, sync)
     else:
         clocks = sync
     best, count = Structure({}, np.zeros((0, 3)), np.zeros((0, 4)), {}), len(footage)
@@ -219,6 +220,18 @@ def _warn_of_clocks(root: Path, names: Sequence[str], clocks: Sequence[Clock], *
     ]
     if unsure:
         notice(f"{root}: warning: the clocks of {first_names(unsure)} are unsure; {CLAP}")
+
+
+def _warn_if_none_found(root: Path, footage: Sequence[Footage], clocks: Sequence[Clock], sync: str) -> None:
+    """Say so if no clock of a still rig could be found; folders of frames are in step unless a way is asked for."""
+    ways = {"auto": "sound or what moves", "audio": "sound", "motion": "what moves"}
+    if sync not in ways or (sync == "auto" and footage[0].video is None):
+        return
+    if all(clock.method == "none" for clock in clocks):
+        instead = "" if sync == "auto" else f"drop --sync {sync}, "
+        notice(
+            f"{root}: warning: no clocks could be found by {ways[sync]}, and all are left as they are; {instead}{CLAP}"
+        )
 
 
 def _find_moving_cameras(

@@ -3,6 +3,7 @@
 import json
 import shutil
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,11 @@ pytest.importorskip("scipy", reason="needs scipy, of the extra poses")
 
 from kpc.encoder.cli import kpposes, read_dataset
 from kpc.encoder.cli.options import parse
+from kpc.encoder.poses import find
+from kpc.encoder.poses.clocks import UNKNOWN
 from kpc.encoder.poses.epipolar_lines import LINES
 from kpc.encoder.poses.orientation import looked_at, up_direction
+from kpc.encoder.poses.structure import Structure
 
 LATE = (0, 7, 0, 3, 12)  # frames
 CAMERAS = rig(5, LATE)
@@ -144,6 +148,25 @@ def test_patterns_that_repeat_themselves_are_named(tmp_path, monkeypatch, capsys
     write_pictures(tmp_path / "pictures", rig(8)[2:])
     assert kpposes.main([str(tmp_path / "pictures")]) == 0
     assert "contradict where these were placed: patterns that repeat themselves" in capsys.readouterr().err
+
+
+def test_it_is_said_if_no_clock_is_found(tmp_path, monkeypatch, capsys):
+    nothing = Structure({}, np.zeros((0, 3)), np.zeros((0, 4)), {})
+    monkeypatch.setattr(find, "reconstruct", lambda *_: nothing)
+    for name in ("a", "b", "c"):
+        film(tmp_path / f"{name}.mp4")
+    assert kpposes.main([str(tmp_path), "--rig", "still", "--sync", "audio"]) == 1
+    said = "warning: no clocks could be found by sound, and all are left as they are; drop --sync audio, film a clap"
+    assert capsys.readouterr().err.count(said) == 1
+    assert kpposes.main([str(tmp_path), "--rig", "still", "--sync", "none"]) == 1
+    assert "clocks" not in capsys.readouterr().err
+    footage, unknown, known = find_footage(tmp_path), [UNKNOWN] * 3, replace(UNKNOWN, method="motion")
+    for sync, way in (("auto", "sound or what moves"), ("motion", "what moves")):
+        find._warn_if_none_found(tmp_path, footage, unknown, sync)
+        assert f"warning: no clocks could be found by {way}, and all are left as" in capsys.readouterr().err
+    find._warn_if_none_found(tmp_path, footage, [UNKNOWN, known, known], "auto")
+    find._warn_if_none_found(tmp_path, [replace(one, video=None) for one in footage], unknown, "auto")
+    assert not capsys.readouterr().err
 
 
 def test_two_cameras_are_too_few(tmp_path, capsys):
