@@ -150,8 +150,8 @@ class Options:
         if not dataset.poses_found:
             return "none", "the poses were given; --refine overrides"
         has_clocks = any(clock != (0.0, 1.0) for clock in dataset.clocks.values())
-        found = "poses and clocks were" if has_clocks else "the poses were"
-        return "all" if has_clocks else "cameras", f"{found} found from the pictures; --refine overrides"
+        found = "the poses were found, not given" + (", and the clocks of the videos differ" if has_clocks else "")
+        return "all" if has_clocks else "cameras", f"{found}; --refine overrides"
 
 
 def parse(argv: list[str]) -> tuple[Options, bool, bool]:

@@ -291,6 +291,9 @@ def test_cameras_that_were_found_are_refined(
     dataset = replace(dataset, clocks={"cam00.mp4": (clock, 1.0)})
     options = Options(Path("set"), Path("out.kpc"), refine=wanted)
     assert options.refine_of(dataset)[0] == options.config(dataset).refine == found
+    if wanted == "auto" and made_by is not None:
+        beside = ", and the clocks of the videos differ" if clock else ""
+        assert options.refine_of(dataset)[1] == f"the poses were found, not given{beside}; --refine overrides"
 
 
 @pytest.mark.usefixtures("quick_coding", "rounded")
