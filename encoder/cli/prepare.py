@@ -109,6 +109,8 @@ def prepare_setting(options: Options) -> Setting:
     sound, sound_from = find_sound(options, dataset)
     check_target_size(options, dataset.clip, sound)
     log(dataset.describe())
+    if options.holdout is None and not dataset.pictures.is_test.any():
+        log("nothing is held out, so the quality will not be measured; --holdout NAME holds out a camera")
     log(f"pixels: {dataset.pixels.describe()}")
     for doubt in doubts(dataset):
         log(f"warning: {doubt}")

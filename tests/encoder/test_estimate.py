@@ -80,6 +80,18 @@ def test_a_time_budget_is_the_training_time(moving: Dataset) -> None:
     assert found.train_s == 600.0 and found.test_pictures == found.held_out_pictures
 
 
+def test_it_is_said_if_nothing_is_held_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(PRESETS, "draft", CONFIG)
+    make.write_nerfstudio(tmp_path / "set", test_filenames=[])
+    words = [str(tmp_path / "set"), "--preset", "draft", "--steps", "30", "--dry-run"]
+    for options, count in (([], 1), (["--holdout", "none"], 0), (["--holdout", "0001"], 0)):
+        assert kpenc.main([*words, *options]) == 0
+        said = capsys.readouterr().err
+        assert said.count("nothing is held out, so the quality will not be measured; --holdout NAME holds") == count
+
+
 def test_a_dry_run_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
