@@ -183,6 +183,7 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
             break
     if still is not None and len(still.views) > len(best.views):
         best = still
+    _warn_if_nothing_in_common(root, [(footage[view], clocks[view]) for view in sorted(best.views)])
     motion = tuple(seen.motion for seen in surveys)
     return Found("still rig", footage, tuple(clocks), tuple(names), best, False, motion)
 
@@ -231,6 +232,24 @@ def _warn_if_none_found(root: Path, footage: Sequence[Footage], clocks: Sequence
         instead = "" if sync == "auto" else f"drop --sync {sync}, "
         notice(
             f"{root}: warning: no clocks could be found by {ways[sync]}, and all are left as they are; {instead}{CLAP}"
+        )
+
+
+def _warn_if_nothing_in_common(root: Path, cameras: Sequence[tuple[Footage, Clock]]) -> None:
+    """Say so if videos have no time in common by their clocks: no scene can be made from them together."""
+    spans = [
+        (one.name, *(clock.offset_s + clock.rate * one.video.times[[0, -1]]))
+        for one, clock in cameras
+        if one.video is not None
+    ]
+    if not spans:
+        return
+    early, late = min(spans, key=lambda span: span[2]), max(spans, key=lambda span: span[1])
+    if early[2] < late[1]:
+        notice(
+            f"{root}: warning: videos have no time in common, and kpenc will refuse them: {early[0]} ends at "
+            f"{early[2]:.6g} s, {late[0]} starts at {late[1]:.6g} s; correct their clocks with --sync offsets.json, "
+            "or remove those that filmed at another time"
         )
 
 

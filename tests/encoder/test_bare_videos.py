@@ -169,6 +169,18 @@ def test_it_is_said_if_no_clock_is_found(tmp_path, monkeypatch, capsys):
     assert not capsys.readouterr().err
 
 
+def test_videos_without_a_time_in_common_are_named(tmp_path, capsys):
+    for name in ("a", "b", "c"):
+        film(tmp_path / f"{name}.mp4")  # 1.2 s
+    footage = find_footage(tmp_path)
+    for late, count in ((1.0, 0), (100.0, 1)):
+        clocks = [UNKNOWN, replace(UNKNOWN, offset_s=late, method="given"), UNKNOWN]
+        find._warn_if_nothing_in_common(tmp_path, list(zip(footage, clocks, strict=True)))
+        said = capsys.readouterr().err
+        assert said.count("no time in common, and kpenc will refuse them: a ends at 1.1 s, b starts at 100 s;") == count
+    find._warn_if_nothing_in_common(tmp_path, [(replace(one, video=None), UNKNOWN) for one in footage])
+
+
 def test_two_cameras_are_too_few(tmp_path, capsys):
     for name in ("a", "b"):
         film(tmp_path / f"{name}.mp4")
