@@ -75,7 +75,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _refuse_other_document(file: Path) -> None:
-    """Refuse to replace a document of someone else: cameras or clocks that were given."""
+    """Refuse to replace a document of someone else, cameras or clocks that were given; name one that is replaced."""
     if not file.exists():
         return
     try:
@@ -84,6 +84,7 @@ def _refuse_other_document(file: Path) -> None:
         document = None
     if not isinstance(document, dict) or document.get("made_by") != MADE_BY:
         raise UsageError(f"{file}: is not a document of kpposes and stays; move it, or choose another name with -o")
+    notice(f"replaces {file}, with any edits in it, once the cameras are found")
 
 
 def _say_if_not_read(folder: Path, file: Path) -> None:

@@ -242,7 +242,9 @@ def test_only_a_document_of_kpposes_is_replaced(tmp_path, capsys):
     (tmp_path / "cameras.html").write_text("<title>My cameras</title>")
     assert kpposes.main([str(tmp_path)]) == 2 and "cameras.html: is no page of KPC and stays" in capsys.readouterr().err
     write_camera_page(tmp_path / "cameras.html", "found before", [], [])
-    assert kpposes.main([str(tmp_path), "--rig", "still"]) == 1 and "depth needs 3 or more" in capsys.readouterr().err
+    assert kpposes.main([str(tmp_path), "--rig", "still"]) == 1
+    said = capsys.readouterr().err
+    assert "depth needs 3 or more" in said and f"replaces {tmp_path / 'transforms.json'}, with any edits" in said
 
 
 def test_cameras_are_found_anew_if_what_they_depend_on_changes(tmp_path, monkeypatch, capsys):
