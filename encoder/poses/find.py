@@ -178,7 +178,7 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
             pictures.sort(key=lambda picture: picture.view)
             return without_false_views(reconstruct(pictures, names, ways[0], features, pairing, ways), is_rig=True)
 
-        best = max(best, _undisturbed(place), key=_worth)
+        best = max(best, _undisturbed(place), key=_rank)
         if len(best.views) == count:
             break
     if still is not None and len(still.views) > len(best.views):
@@ -188,7 +188,7 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
     return Found("still rig", footage, tuple(clocks), tuple(names), best, False, motion)
 
 
-def _worth(structure: Structure) -> tuple[int, float]:
+def _rank(structure: Structure) -> tuple[int, float]:
     """Return by what one of several models of the same cameras is chosen: the largest."""
     return len(structure.views), -structure.error
 
