@@ -20,6 +20,11 @@ async function pictures(cameras) {
   const actor = new KpcObject('scene.kpc', { quality: 'reference' });
   const events = [];
   for (const name of ['loadedmetadata', 'canplay', 'error']) actor.addEventListener(name, () => events.push(name));
+  actor.currentTime = 0.75;
+  let begun = null;
+  actor.addEventListener('loadedmetadata', () => {
+    begun = actor.currentTime;
+  });
   actor.position.set(1, 0.3, -0.5);
   actor.rotation.set(-1.5, 0.1, 0.2);
   actor.scale.setScalar(0.5);
@@ -98,6 +103,7 @@ async function pictures(cameras) {
     events,
     hits: hit.length,
     message: actor.error?.message ?? null,
+    begun,
     object: actor.matrixWorld.elements,
     squares: squares.map(({ mesh, ...square }) => ({ ...square, matrix: mesh.matrixWorld.elements })),
   };
@@ -125,6 +131,7 @@ export function threeScenarios(scenario, browser, address, folder) {
     const page = await open(`page.html?${encodeURIComponent(html)}`);
     const found = await page.evaluate(`(${pictures})(${JSON.stringify(CAMERAS)})`);
     assert.equal(found.message, null);
+    assert.ok(found.begun > 0, 'a time that was set before the clip was there is forgotten');
     await close(page);
     return found;
   });

@@ -67,6 +67,8 @@ export class KpcObject extends Mesh<BoxGeometry, MeshBasicMaterial> {
   readonly #opening = new AbortController();
   #drawing: Drawing | null = null;
   #isShown = false;
+  /** Where to begin once the duration is known. */
+  #startTime = 0;
   #lastFrame = -1;
   #lastTime = 0;
 
@@ -84,12 +86,13 @@ export class KpcObject extends Mesh<BoxGeometry, MeshBasicMaterial> {
   }
 
   get currentTime(): number {
-    return this.#clock.time;
+    return this.clip ? this.#clock.time : this.#startTime;
   }
 
   set currentTime(seconds: number) {
+    if (!Number.isFinite(seconds)) throw new TypeError('currentTime must be a finite number');
     if (this.clip) this.#clock.seek(seconds);
-    else this.#clock.begin(seconds);
+    else this.#startTime = Math.max(seconds, 0);
   }
 
   /** Seconds from the first frame to the last; `NaN` before it is known. */
@@ -160,9 +163,8 @@ export class KpcObject extends Mesh<BoxGeometry, MeshBasicMaterial> {
     const [size, centre] = [this.box.getSize(new Vector3()), this.box.getCenter(new Vector3())];
     this.geometry.dispose();
     this.geometry = new BoxGeometry(...size.toArray()).translate(...centre.toArray());
-    const time = this.#clock.time;
     Object.assign(this.#clock, { duration: clip.duration, frameCount: clip.frameCount });
-    this.#clock.begin(time);
+    this.#clock.begin(this.#startTime);
     this.clip = clip;
     this.#emit('loadedmetadata');
   }

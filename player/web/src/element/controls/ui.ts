@@ -117,6 +117,9 @@ export class Ui {
     const cover = make('div', { class: 'cover' }, this.#spinner, this.#large.element, this.#error);
     const panels = [...this.#popups.map(({ panel }) => panel), this.#keys];
     this.player = make('div', { class: 'player', part: 'player' });
+    this.#poster.addEventListener('error', () => {
+      this.#poster.hidden = true; // or browsers show that a picture is missing
+    });
     this.player.append(this.stage, this.#poster, make('div', { class: 'ring' }));
     this.player.append(this.#hint, cover, this.#notice, this.#bar, ...panels);
     root.append(this.player);
