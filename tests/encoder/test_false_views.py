@@ -75,7 +75,7 @@ def test_views_are_placed_again_without_a_false_one():
     found = find._undisturbed(place)
     assert asked == [ALL, Pairing(without=(3,))]
     assert sorted(found.views) == [0, 1, 2] and found.dropped == (3,)
-    assert find._worth(found) == (3, -found.error)
+    assert find._rank(found) == (3, -found.error)
 
 
 def test_a_view_is_not_matched_if_it_is_left_out():
