@@ -170,7 +170,7 @@ def test_a_full_disk_is_an_error_whatever_ffmpeg_returns(tmp_path: Path, monkeyp
     """As ffmpeg 5.1 does, whose exit code is 0 if the end of a file cannot be written."""
     script = tmp_path / "ffmpeg"
     script.write_text(
-        '#!/bin/sh\nfor file; do :; done\ncat > "${file#file:}"\n'
+        '#!/bin/sh\nfor word; do case "$word" in file:*) film="${word#file:}" ;; esac; done\ncat > "$film"\n'
         'echo "av_interleaved_write_frame(): No space left on device" >&2\n'
     )
     monkeypatch.setattr(films, "ffmpeg_binary", lambda: str(script))
