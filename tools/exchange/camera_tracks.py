@@ -1,6 +1,5 @@
 """Cameras between `cameras.json` and the files of other programs: still cameras, or one that moves along a path."""
 
-import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +8,7 @@ import numpy as np
 
 from kpc.format.common.errors import DatasetError, UsageError
 from kpc.format.scene.cameras import MAX_SIDE, Camera, View, load_views
-from kpc.format.scene.rotations import quaternion_of, rotation_of, slerp
+from kpc.format.scene.rotations import quaternion_of, slerp
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.viewpoints import fit_camera
 from kpc.tools.exchange.placement import Placement
@@ -112,28 +111,19 @@ def with_instants_between(
     if len(keys) < 2:
         return keys
     ends, gaps = poses(keys), np.diff(keys)
-    looked_at = poses(keys[:-1] + LOOKED_AT * gaps)
-    extent = float(np.ptp(ends[:, :3, 3], axis=0).max())
-    found = [keys[:1]]
-    for number, gap in enumerate(gaps):
-        linear = _between(ends[number], ends[number + 1], LOOKED_AT)
-        moved, turned = linear[:3, 3] - looked_at[number, :3, 3], linear[:3, :3].T @ looked_at[number, :3, :3]
-        is_linear = np.linalg.norm(moved) <= TOLERANCE * extent and np.linalg.norm(turned - np.eye(3)) <= TOLERANCE
-        count = 1 if is_linear else max(math.ceil(gap / step - 1e-6), 1)
-        found.append(keys[number] + gap * np.arange(1, count + 1) / count)
-        if sum(map(len, found)) > MAX_VIEWS:
-            raise DatasetError(
-                f"{where}: sampled between its keys, it has more than {MAX_VIEWS} instants; export fewer"
-            )
-    return np.concatenate(found)
-
-
-def _between(one: np.ndarray, two: np.ndarray, share: float) -> np.ndarray:
-    """Return the pose at a share of the way, along a line and a great circle of rotations."""
-    pose = (1 - share) * one + share * two
-    turns = quaternion_of(np.stack([one[:3, :3], two[:3, :3]]))
-    pose[:3, :3] = rotation_of(slerp(turns[:1], turns[1:], np.full((1, 1), share))[0])
-    return pose
+    seen = poses(keys[:-1] + LOOKED_AT * gaps)
+    eyes, turns = ends[:, :3, 3], quaternion_of(ends[:, :3, :3])
+    linear = (1 - LOOKED_AT) * eyes[:-1] + LOOKED_AT * eyes[1:]
+    moved = np.linalg.norm(linear - seen[:, :3, 3], axis=1)
+    circled = slerp(turns[:-1], turns[1:], np.full((len(gaps), 1), LOOKED_AT))
+    cosines = (circled * quaternion_of(seen[:, :3, :3])).sum(1)  # of half the angle between two rotations
+    turned = np.sqrt(8 * np.maximum(1 - cosines**2, 0))  # the Frobenius norm of R^T R' - 1
+    is_linear = (moved <= TOLERANCE * np.ptp(eyes, axis=0).max()) & (turned <= TOLERANCE)
+    counts = np.where(is_linear, 1, np.maximum(np.ceil(gaps / step - 1e-6), 1))
+    if counts.sum() + 1 > MAX_VIEWS:
+        raise DatasetError(f"{where}: sampled between its keys, it has more than {MAX_VIEWS} instants; export fewer")
+    added = [key + gap * np.arange(1, count + 1) / count for key, gap, count in zip(keys, gaps, counts, strict=False)]
+    return np.concatenate([keys[:1], *added])
 
 
 def sampled_note(fps: float) -> str:

@@ -241,7 +241,7 @@ def _has_keyed_matrix(stage: Usd.Stage, camera: UsdGeom.Camera) -> bool:
 
 
 def _rigid(pose: np.ndarray) -> np.ndarray:
-    """Return a pose with the nearest rotation, as far as it is one."""
+    """Return a pose whose rotation is the one nearest to what the matrix holds."""
     rigid = pose.copy()
     rigid[:3, :3] = rotation_of(quaternion_of(pose[:3, :3]))
     return rigid
