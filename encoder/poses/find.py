@@ -152,17 +152,18 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
     names = [one.name for one in footage]
     # Views of one size may differ in their lenses.
     ways = (_lenses([seen.median.shape for seen in surveys]), list(range(len(footage))))
+
+    def place(pictures: Sequence[Picture], features: int) -> Structure:
+        def without_false(pairing: Pairing) -> Structure:
+            return without_false_views(reconstruct(pictures, names, ways[0], features, pairing, ways), is_rig=True)
+
+        return _undisturbed(without_false)
+
     still: Structure | None = None
     if isinstance(sync, str):
         clocks = clocks_by_sound(footage, sync)
         if wants_motion(footage, clocks, sync):
-
-            def place_still(pairing: Pairing) -> Structure:
-                return without_false_views(
-                    reconstruct(still_pictures(surveys), names, ways[0], ATTEMPTS[0][0], pairing, ways), is_rig=True
-                )
-
-            still = _undisturbed(place_still)
+            still = place(list(still_pictures(surveys)), ATTEMPTS[0][0])
             clocks = clocks_by_motion(footage, surveys, clocks, still.views)
         _warn_of_clocks(root, names, clocks)
         _warn_if_none_found(root, footage, clocks, sync)
@@ -172,13 +173,9 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
     for number, (features, instants) in enumerate(ATTEMPTS):
         if number > 0:
             notice(f"{root}: {len(best.views)} of {count} cameras placed; trying again with more features")
-
-        def place(pairing: Pairing, features: int = features, instants: int = instants) -> Structure:
-            pictures = [*still_pictures(surveys), *moving_pictures(footage, surveys, clocks, instants)]
-            pictures.sort(key=lambda picture: picture.view)
-            return without_false_views(reconstruct(pictures, names, ways[0], features, pairing, ways), is_rig=True)
-
-        best = max(best, _undisturbed(place), key=_rank)
+        pictures = [*still_pictures(surveys), *moving_pictures(footage, surveys, clocks, instants)]
+        pictures.sort(key=lambda picture: picture.view)
+        best = max(best, place(pictures, features), key=_rank)
         if len(best.views) == count:
             break
     if still is not None and len(still.views) > len(best.views):

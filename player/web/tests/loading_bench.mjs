@@ -1,12 +1,12 @@
 /**
  * Times pages over a slow line: `node loading_bench.mjs CHROMIUM FOLDER SECONDS PAGE ...`, each in its own browser.
  *
- * A page calls `firstPicture()` once it shows something, or `firstPictureGiven(gl)` once WebGL has been given it. Writes
- * a list as JSON: milliseconds from navigation until it is shown, the longest task of the page's main thread until it is
- * given, by the clock and by its processor time, bytes fetched, and frames a second that are drawn on the canvas in the
- * SECONDS after that. Of a page named seeks.html it writes instead milliseconds from a seek to the first picture there:
- * once, a second after the first picture, to the end of a clip of which nothing but the beginning has arrived, then to
- * and fro within what is buffered there.
+ * A page calls `firstPicture()` once it shows something, or `firstPictureGiven(gl)` once WebGL has been given it.
+ * Writes a list as JSON: milliseconds from navigation until it is shown, the longest task of the page's main thread
+ * until it is given, by the clock and by its processor time, bytes fetched, and frames a second that are drawn on the
+ * canvas in the SECONDS after that. Of a page named seeks.html it writes instead milliseconds from a seek to the
+ * first picture there: once, a second after the first picture, to the end of a clip of which nothing but the
+ * beginning has arrived, then to and fro within what is buffered there.
  */
 
 import { readFileSync } from 'node:fs';

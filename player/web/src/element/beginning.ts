@@ -1,4 +1,4 @@
-/** Where a clip begins, before that can be shown: by the page's link, by what a script has set, or where it was left. */
+/** Where a clip begins, before that can be shown: by the page's link, by what a script has set, or where it was. */
 
 import type { Moment } from './link.js';
 

@@ -15,7 +15,7 @@ export interface PlayerError {
 }
 
 export const CONTEXT_LOST =
-  'The browser has taken the graphics card away. The picture comes back by itself, unless the page has too many players.';
+  'The browser has taken the graphics card away. The picture comes back by itself unless the page has many players.';
 export const INCOMPLETE = 'This file is incomplete. What is there of it is shown.';
 
 /** Return what the property `error` says of something that was thrown. */
@@ -61,7 +61,7 @@ function sentenceOf(code: PlayerErrorCode, detail: string, src: string, origin: 
     case 'worker':
       return `The decoder cannot run in this page: ${detail}.`;
     case 'no-webgl':
-      return 'This browser has no WebGL2 left, which draws the scene. Update it, allow it to use the graphics card, or show fewer players.';
+      return 'This browser has no WebGL2 left to draw with. Update it, allow the graphics card, or show fewer players.';
     case 'graphics':
       return `This browser cannot draw the scene: ${detail}.`;
     default:
