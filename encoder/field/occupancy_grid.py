@@ -140,10 +140,13 @@ class OccupancyGrid:
             "occupied": torch.from_numpy(self._found),
             "dense": torch.from_numpy(self._dense),
             "known": self._is_sampled,
+            "keeps": self.kept is not None,
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned."""
+        """Take over what `state` returned; `kept` is given up if it was when the checkpoint was written."""
+        if not state.get("keeps", False):
+            self.kept = None
         names = ("log_density", "peak", "occupied", "dense")
         self.log_density, self.peak, self._found, self._dense = (state[name].cpu().numpy() for name in names)
         self._activate()

@@ -257,9 +257,9 @@ class Trainer:
     def _update_grid(self, fraction: float) -> None:
         """Update the occupancy grid where it is due at this step."""
         config = self.config
-        if fraction >= config.moving_kept:
-            self.grid.kept = None
         if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
+            if fraction >= config.moving_kept:
+                self.grid.kept = None
             self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
         if self.slots > 1 and self.step >= 4 * config.occupancy_start and self.step % config.occupancy_split_every == 0:
             self.grid.split(self.density_at, self.slots, self.rng)

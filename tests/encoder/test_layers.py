@@ -177,6 +177,19 @@ def test_cells_where_something_moves_stay_occupied_for_a_part_of_the_run(rolling
     assert run.grid.kept is None and (run.grid.occupied & kept).sum() < kept.sum()
 
 
+@pytest.mark.parametrize("steps", [6, 14, 20])
+def test_a_resumed_run_keeps_the_same_cells_occupied(rolling: Dataset, tmp_path: Path, steps: int) -> None:
+    area, _ = find_moving_area(rolling, 2 * BOX, None)
+    config = replace(RUN, moving_area=area.box, occupancy_start=1, occupancy_every=4, moving_kept=0.5, steps=20)
+    first, second = (Trainer(rolling, config, 2 * BOX, "cpu", moving=area) for _ in range(2))
+    first.grid.threshold = second.grid.threshold = 100.0  # nothing is dense enough
+    first.run_until(steps)
+    first.save(tmp_path / "checkpoint.kpck")
+    second.resume(tmp_path / "checkpoint.kpck")
+    for name in ("occupied", "active", "marched"):
+        np.testing.assert_array_equal(getattr(second.grid, name), getattr(first.grid, name))
+
+
 def test_no_area_is_found_where_cameras_move_or_all_of_space_does(moving: Dataset, rolling: Dataset) -> None:
     assert find_moving_area(moving, BOX, None) == (None, "cameras move, or show one picture each")
     area, why = find_moving_area(rolling, np.array([[-0.9, -0.3, -0.3], [0.9, 0.3, 0.3]], np.float32), None)
