@@ -19,6 +19,7 @@ from kpc.encoder.cli.report import (
     SPACES,
     describe_corrections,
     describe_occupancy,
+    describe_overfitting,
     describe_pruning,
     log,
     show_progress,
@@ -26,7 +27,7 @@ from kpc.encoder.cli.report import (
 from kpc.encoder.cli.transcode import coding_figures
 from kpc.encoder.cli.work_folder import CHECKPOINT, clear_work_folder, save_scene
 from kpc.encoder.datasets import Dataset
-from kpc.encoder.evaluation.evaluate import Quality, SceneRenderer, evaluate
+from kpc.encoder.evaluation.evaluate import Quality, SceneRenderer, evaluate, training_psnr
 from kpc.encoder.evaluation.preview import Preview
 from kpc.encoder.evaluation.testing_time import affordable_pictures, picture_seconds
 from kpc.encoder.evaluation.validation_rays import ValidationRays
@@ -48,6 +49,7 @@ from kpc.format.scene.scene import Scene
 
 MAX_CAMERAS = 32  # cameras of the dataset that the file holds
 MAX_SLOTS = 8  # time slots of the occupancy, before they are merged
+TRAINING_PICTURES = 8  # that are compared with as many held-out ones
 
 
 class Abandoned(KeyboardInterrupt):
@@ -122,6 +124,10 @@ def _write(options: Options, setting: Setting, trainer: Trainer, started: float)
     most = _most_tested(options, SceneRenderer(decoded), trainer)
     test = evaluate(decoded, dataset, most=most, label="testing the coded file", parts=True)
     uncoded = evaluate(scene, dataset, most=most, label="testing the model")
+    if test is not None and not decoded.appearances:
+        trained_psnr = training_psnr(decoded, dataset, min(test.pictures, TRAINING_PICTURES))
+        if warning := describe_overfitting(test.psnr, trained_psnr):
+            log(warning)
     figures = {
         **_test_figures(test, dataset),
         "coding_loss_db": uncoded.psnr - test.psnr if test and uncoded else coded.loss_db,

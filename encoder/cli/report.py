@@ -40,6 +40,9 @@ REFINED = {
 # The most cameras of which a table is printed.
 TABLE_ROWS = 40
 
+# How far in dB held-out pictures may be behind those that were trained on before a warning says so.
+OVERFITTED_DB = 3.0
+
 
 def log(*lines: str) -> None:
     """Print lines on stderr, at once."""
@@ -131,6 +134,17 @@ def describe_corrections(corrections: Sequence[Correction], frame_s: float) -> s
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     return "\n".join(["corrections of the cameras:", *lines])
+
+
+def describe_overfitting(test_psnr: float, training_psnr: float) -> str:
+    """Return a warning where held-out pictures are far behind those that were trained on, else an empty text."""
+    behind = training_psnr - test_psnr
+    if behind <= OVERFITTED_DB:
+        return ""
+    return (
+        f"warning: held-out pictures are {behind:.1f} dB behind those trained on ({training_psnr:.1f} dB): the model "
+        "is overfitted; more cameras or pictures help, for one moving camera slower motion, too"
+    )
 
 
 def print_result(result: dict[str, Any], options: Options, as_json: bool) -> None:

@@ -237,9 +237,20 @@ def evaluate(
     return replace(quality, moving_psnr=moving_psnr, still_psnr=still_psnr)
 
 
+def training_psnr(scene: Scene, dataset: Dataset, most: int) -> float:
+    """Return the mean PSNR in dB over at most `most` pictures that were trained on, spread evenly.
+
+    How far held-out pictures are behind it is how much the model is overfitted. The scene has no appearances.
+    """
+    trained = spread_evenly(dataset.pictures, np.flatnonzero(~dataset.pictures.is_test), most)
+    renderer = SceneRenderer(scene)
+    shown = progress(trained.tolist(), "testing on training pictures", unit="pictures")
+    return float(np.mean([compare(renderer, dataset, number).psnr() for number in shown]))
+
+
 @dataclass(frozen=True)
 class Comparison:
-    """The columns of a held-out picture that count, as they are rendered and as they were filmed.
+    """The columns of a picture that count, as they are rendered and as they were filmed.
 
     Attributes:
         picture, truth: (H, W, 3) float32 in [0, 1], rendered and filmed.

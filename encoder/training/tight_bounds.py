@@ -25,6 +25,16 @@ RAYS = 1 << 17
 # Share of the surface points that each of the six sides of the box may cut off, before MARGIN is added.
 OUTLIERS = 1e-3
 
+# The same of the points nearest to the box on the rays of opaque pixels: a hand that is stretched out now and then has
+# few pixels, and alpha has few errors (docs/design/training.md).
+OPAQUE_OUTLIERS = 1e-4
+
+# How often the box is made larger, as other points are the nearest to a larger one.
+OPAQUE_ROUNDS = 4
+
+# Halvings of the part of a line in which the point that is nearest to a box lies.
+HALVINGS = 30
+
 # Margin on every side, as a share of the longest edge: the coarse field is blurred, and few rays show fast motion.
 MARGIN = 0.04
 
@@ -42,7 +52,9 @@ def trim_box(
 
     A coarse field is trained on the CPU for a tenth of `config.steps`, but for at most MAX_STEPS. The result spans the
     OUTLIERS to 1 - OUTLIERS quantiles of the points where rays hit a surface, and MARGIN more, within `aabb`. A pass
-    changes nothing after fewer than MIN_STEPS, or where less than 1 % of the rays hit a surface.
+    changes nothing after fewer than MIN_STEPS, or where less than 1 % of the rays hit a surface. In pictures with alpha
+    what is opaque lies in the box, so it is made large enough to be crossed by the rays of all such pixels: the coarse
+    field lacks thin limbs that move fast.
 
     Near and far of found cameras have wide margins, and in a box much larger than the scene the coarse field is fog in
     places. With such cameras there are up to PASSES passes, each in the box that the last one found, until one leaves
@@ -113,6 +125,43 @@ def _trim_once(
     if len(surfaces) < RAYS // 100:
         return aabb, trainer.elapsed_s
     corners = np.quantile(surfaces, (OUTLIERS, 1 - OUTLIERS), axis=0)
+    if dataset.has_alpha and dataset.masks is None:
+        corners = _reaching_opaque_rays(corners, trainer)
     margin = MARGIN * (corners[1] - corners[0]).max()
     trimmed = np.stack([np.maximum(aabb[0], corners[0] - margin), np.minimum(aabb[1], corners[1] + margin)])
     return trimmed.astype(np.float32), trainer.elapsed_s
+
+
+def _reaching_opaque_rays(corners: np.ndarray, trainer: Trainer) -> np.ndarray:
+    """Return a box (2, 3) made larger, so that it is crossed by the rays of opaque pixels, but for OPAQUE_OUTLIERS."""
+    dataset, sampler, rng = trainer.dataset, trainer.sampler, np.random.default_rng(trainer.config.seed)
+    pixels = sampler.draw_pixels(rng, RAYS, object_rays=1.0)
+    places = pixels.row * dataset.pictures.width[pixels.picture] + pixels.column
+    alpha = dataset.pixels.read(dataset.pictures.offset[pixels.picture] + places)[:, 3]
+    rays, _ = sampler.rays(rng, pixels, trainer.background)
+    opaque = alpha > 127
+    origins, directions = rays.origins.numpy()[opaque], rays.directions.numpy()[opaque]
+    for _ in range(OPAQUE_ROUNDS if opaque.any() else 0):
+        nearest = nearest_to_box(corners, origins, directions)
+        low, high = np.quantile(nearest, (OPAQUE_OUTLIERS, 1 - OPAQUE_OUTLIERS), axis=0)
+        corners = np.stack([np.minimum(corners[0], low), np.maximum(corners[1], high)])
+    return corners
+
+
+def nearest_to_box(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the point of each line o + t d that is nearest to a box (2, 3), (N, 3); one in the box if it crosses it.
+
+    The distance is convex in t, so the place where its derivative, which has the sign of d . (p - q) with q the point
+    of the box that is nearest to p, changes its sign is found by bisection.
+    """
+    units = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    middle = ((corners.mean(0) - origins) * units).sum(1)
+    beside = np.linalg.norm(origins + middle[:, None] * units - corners.mean(0), axis=1)
+    reach = beside + np.linalg.norm(corners[1] - corners[0])
+    low, high = middle - reach, middle + reach
+    for _ in range(HALVINGS):
+        t = (low + high) / 2
+        points = origins + t[:, None] * units
+        is_past = ((points - np.clip(points, *corners)) * units).sum(1) > 0
+        low, high = np.where(is_past, low, t), np.where(is_past, t, high)
+    return points

@@ -9,7 +9,7 @@ import pytest
 
 import datasets as make
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, spread_evenly, ssim
+from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, spread_evenly, ssim, training_psnr
 from kpc.encoder.evaluation.ground_truth import ground_truth
 from kpc.encoder.evaluation.testing_time import FEWEST_PICTURES, affordable_pictures, picture_seconds
 from kpc.format.common.fidelity import psnr
@@ -103,6 +103,15 @@ def test_ground_truth_without_alpha(tmp_path: Path) -> None:
         evaluate(tiny_scene(), load_dataset(tmp_path / "set", tmp_path / "cache", holdout="none", progress=False))
         is None
     )
+
+
+def test_the_psnr_of_pictures_that_were_trained_on(blender: Dataset) -> None:
+    scene = tiny_scene()
+    swapped = replace(blender, pictures=replace(blender.pictures, is_test=~blender.pictures.is_test))
+    quality = evaluate(scene, swapped)
+    assert quality is not None
+    assert training_psnr(scene, blender, 100) == pytest.approx(quality.psnr, abs=1e-9)
+    assert training_psnr(scene, blender, 2) == pytest.approx(evaluate(scene, swapped, most=2).psnr, abs=1e-9)
 
 
 def test_evaluate_is_the_mean_over_held_out_pictures(blender: Dataset) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from kpc.encoder.cli.options import Options
-from kpc.encoder.cli.report import print_result
+from kpc.encoder.cli.report import describe_overfitting, print_result
 
 RESULT = {
     "test_psnr": 30.0, "test_psnr_moving": 25.125, "test_psnr_still": 33.0, "test_ssim": 0.9, "test_pictures": 4,
@@ -32,3 +32,8 @@ def test_pictures_of_frames_that_groups_share_are_said_to_count_twice(
     groups = [{"frames": frames, "size_bytes": 2500, "test_psnr": 30.0} for frames in ([0, 15], [start, 29])]
     print_result(RESULT | {"groups": groups}, Options(Path("clip"), Path("out.kpc")), as_json=False)
     assert ("4 of 30 pictures (those of frames that two groups share count twice)" in capsys.readouterr().out) == shared
+
+
+def test_held_out_pictures_far_behind_those_trained_on_are_a_warning() -> None:
+    assert describe_overfitting(27.0, 30.0) == "" and describe_overfitting(30.0, 27.0) == ""
+    assert "held-out pictures are 4.1 dB behind those trained on (31.0 dB)" in describe_overfitting(26.9, 31.0)

@@ -10,7 +10,7 @@ from kpc.encoder.cli.options import Options
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.training import tight_bounds, train
-from kpc.encoder.training.tight_bounds import MAX_STEPS, PASSES, trim_box
+from kpc.encoder.training.tight_bounds import MAX_STEPS, PASSES, nearest_to_box, trim_box
 from kpc.encoder.training.train import Report
 
 CONFIG = TrainConfig(steps=1500, rays=256, samples=12288, warmup=5)
@@ -23,6 +23,23 @@ def test_a_large_box_is_trimmed_to_the_object(moving: Dataset) -> None:
     assert seconds > 0 and box.dtype == np.float32 and (box[0] < box[1]).all()
     assert (box[0] >= LARGE[0]).all() and (box[1] <= LARGE[1]).all()
     assert np.prod(box[1] - box[0]) < 0.5 * np.prod(LARGE[1] - LARGE[0])
+
+
+def test_the_points_of_lines_that_are_nearest_to_a_box() -> None:
+    rng = np.random.default_rng(0)
+    box = np.array([[-1.0, -0.5, -0.2], [1.0, 0.5, 0.3]])
+    origins, directions = rng.uniform(-3, 3, (300, 3)), rng.normal(size=(300, 3))
+    nearest = nearest_to_box(box, origins, directions)
+    distances = np.linalg.norm(nearest - np.clip(nearest, *box), axis=1)
+    t = np.linspace(-8, 8, 20001)[:, None]
+    least = []
+    for origin, direction in zip(origins, directions, strict=True):
+        points = origin + t * direction / np.linalg.norm(direction)
+        least.append(np.linalg.norm(points - np.clip(points, *box), axis=1).min())
+    np.testing.assert_allclose(distances, least, atol=1e-3)
+    assert 10 < (distances < 1e-9).sum() < 200
+    across = np.cross(nearest - origins, directions)
+    np.testing.assert_allclose(across, 0, atol=1e-9)  # they lie on the lines
 
 
 def test_a_short_run_keeps_its_box(moving: Dataset) -> None:
