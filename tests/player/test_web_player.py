@@ -36,7 +36,7 @@ from sounds import decoded, sweep, write_clip_with_sound
 
 SAMPLE = Path(__file__).parent.parent.parent / "samples" / "default.kpc"
 SCRIPT = web_page.WEB / "tests" / "element_browser.mjs"
-SCRIPTS = [SCRIPT, *(SCRIPT.with_name(f"{name}_browser.mjs") for name in ("headset", "three"))]
+SCRIPTS = [SCRIPT, *(SCRIPT.with_name(f"{name}_browser.mjs") for name in ("headset", "scrolling", "three"))]
 SCENARIOS = re.findall(
     r"^ *scenario\(['`](.+)['`], async", "".join(script.read_text(encoding="utf-8") for script in SCRIPTS), re.MULTILINE
 )

@@ -155,6 +155,27 @@ test('a view goes on after a drag, not after a rest, and not with inertia off', 
   assert.equal(drag(0, false), 0);
 });
 
+test('a drag that is taken back leaves the view where it was held, or was sent meanwhile, without inertia', () => {
+  const control = new ViewControl(rig, new Limits(LIMITS, UP), rig.cameras[1]);
+  const drag = () => {
+    control.hold();
+    for (let i = 0; i < 3; i++) control.orbit(0.02, 0.1, 0.016);
+  };
+  const taken = (view: typeof start) => {
+    control.restore();
+    control.release();
+    assert.equal(control.advance(0.016), false);
+    assert.equal(control.view, view);
+  };
+  const { view } = control;
+  drag();
+  taken(view);
+  drag();
+  control.lookFrom(start);
+  control.orbit(0.02, 0.1, 0.016);
+  taken(start);
+});
+
 test('a camera that was chosen is left where it is, outside the limits, too', () => {
   const control = new ViewControl(rig, new Limits(LIMITS, UP), rig.cameras[1]);
   assert.equal(control.advance(0.1), false);

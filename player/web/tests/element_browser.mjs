@@ -10,6 +10,7 @@ import { join } from 'node:path';
 import { chromium } from 'playwright-core';
 import { FLAGS } from './browser_flags.mjs';
 import { headsetScenarios } from './headset_browser.mjs';
+import { scrollingScenarios } from './scrolling_browser.mjs';
 import { threeScenarios } from './three_browser.mjs';
 
 const EVENTS = [
@@ -368,30 +369,6 @@ scenario('heeds the keys of the desktop player', async () => {
   await inside(page, 'input[aria-label="Time"]').focus();
   await press(' ');
   assert.equal(await player(page, (it) => it.paused), true);
-  await close(page);
-});
-
-scenario('is turned by one finger, moved and pinched by two', async () => {
-  const page = await open(TAG, { context: { hasTouch: true, isMobile: true } });
-  await shown(page);
-  const client = await page.context().newCDPSession(page);
-  const touch = async (type, ...points) =>
-    client.send('Input.dispatchTouchEvent', { type, touchPoints: points.map(([x, y], id) => ({ x, y, id })) });
-  const before = numbers(await player(page, (it) => it.camera));
-  const box = await inside(page, '.stage').boundingBox();
-  const at = (x, y) => [box.x + x, box.y + y];
-  await touch('touchStart', at(30, 40));
-  for (let x = 34; x <= 60; x += 4) await touch('touchMove', at(x, 40));
-  await touch('touchEnd');
-  await page.waitForTimeout(800);
-  const turned = numbers(await player(page, (it) => it.camera));
-  assert.ok(Math.hypot(...[0, 1, 2].map((i) => turned[i] - before[i])) > 0.1);
-  await touch('touchStart', at(50, 40), at(70, 40));
-  for (let by = 1; by <= 10; by++) await touch('touchMove', at(50 - by, 40), at(70 + by, 40));
-  await touch('touchEnd');
-  const pinched = numbers(await player(page, (it) => it.camera));
-  const distance = (view) => Math.hypot(...[0, 1, 2].map((i) => view[i] - view[i + 3]));
-  assert.ok(distance(pinched) < 0.7 * distance(turned));
   await close(page);
 });
 
@@ -944,6 +921,7 @@ scenario('can be used without a mouse', async () => {
 });
 
 headsetScenarios(scenario, { open, shown, player, button, inside, close, tag: TAG });
+scrollingScenarios(scenario, { open, shown, player, inside, close, numbers, tag: TAG });
 threeScenarios(scenario, browser, address, folder);
 
 /** Milliseconds that a scenario may take. */

@@ -126,8 +126,11 @@ export class Input {
   }
 
   readonly #up = (event: PointerEvent): void => {
-    this.#pointers.delete(event.pointerId);
-    if (this.#pointers.size === 0) this.#options.view()?.release();
+    const view = this.#options.view();
+    // A stroke that the browser takes, to scroll the page, was never the player's.
+    if (this.#pointers.delete(event.pointerId) && event.type === 'pointercancel') view?.restore();
+    if (this.#pointers.size === 0) view?.release();
+    else view?.hold();
     const pressed = this.#pressed;
     this.#pressed = null;
     if (event.type === 'pointerup' && pressed && event.timeStamp - pressed.at < CLICK_MS) this.#options.clicked(event);

@@ -48,7 +48,7 @@ export class KpcPlayer extends AudibleElement implements Model {
   readonly #beginning = new Beginning();
   #readyState = 0;
   #progressAt = Number.NEGATIVE_INFINITY;
-  readonly #scroll = new PageScroll();
+  readonly #scroll = new PageScroll(this);
 
   constructor() {
     super();

@@ -21,6 +21,8 @@ export class ViewControl {
   /** Whether hands have moved the view since it was chosen; limits count only then. */
   #isMoved = false;
   #isHeld = false;
+  /** The view when it was held, and whether hands had moved it before. */
+  #heldFrom: [View, boolean];
   /** Radians a second to the right and up, while dragged and thereafter. */
   #speed: [number, number] = [0, 0];
 
@@ -30,6 +32,7 @@ export class ViewControl {
     opening: Camera,
   ) {
     this.#view = viewOf(rig, opening);
+    this.#heldFrom = [this.#view, false];
   }
 
   get view(): View {
@@ -40,12 +43,20 @@ export class ViewControl {
   lookFrom(view: View): void {
     this.#view = view;
     this.#isMoved = false;
+    this.#heldFrom = [view, false];
     this.#speed = [0, 0];
   }
 
   /** Begin to drag: what still moves stops. */
   hold(): void {
     this.#isHeld = true;
+    this.#heldFrom = [this.#view, this.#isMoved];
+    this.#speed = [0, 0];
+  }
+
+  /** Take back the drag so far. */
+  restore(): void {
+    [this.#view, this.#isMoved] = this.#heldFrom;
     this.#speed = [0, 0];
   }
 
