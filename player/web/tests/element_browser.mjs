@@ -737,11 +737,11 @@ scenario('draws again once a lost context is back', async () => {
     globalThis.extension.loseContext();
   });
   await until(page, (it) => it.shadowRoot.querySelector('.notice').textContent.includes('graphics card'));
-  await page.evaluate(() => globalThis.extension.restoreContext());
-  await until(page, (it) => it.shadowRoot.querySelector('.notice').textContent === '');
   const range = await player(page, async (it) => {
-    it.pause();
-    const picture = await createImageBitmap(await it.toBlob());
+    const early = it.toBlob(); // while it plays, which waits for the card
+    await new Promise((resolve) => setTimeout(resolve, 200));
+    globalThis.extension.restoreContext();
+    const picture = await createImageBitmap(await early);
     const canvas = new OffscreenCanvas(picture.width, picture.height);
     const context = canvas.getContext('2d');
     context.drawImage(picture, 0, 0);
@@ -750,6 +750,19 @@ scenario('draws again once a lost context is back', async () => {
     return Math.max(...reds) - Math.min(...reds);
   });
   assert.ok(range > 100);
+  await until(page, (it) => it.shadowRoot.querySelector('.notice').textContent === '');
+  const rejected = await player(page, async (it) => {
+    it.pause();
+    globalThis.extension.loseContext();
+    const picture = it.toBlob();
+    await new Promise((resolve) => setTimeout(resolve, 200));
+    it.remove();
+    return picture.then(
+      () => 'resolved',
+      (error) => `${error.name}: ${error.message}`,
+    );
+  });
+  assert.equal(rejected, 'InvalidStateError: the scene was removed before its picture was there');
   await close(page);
 });
 

@@ -46,8 +46,9 @@ export class Picture {
     return new Picture(canvas, new Renderer(gl, options));
   }
 
-  get isLost(): boolean {
-    return this.#renderer.isLost;
+  /** Whether there is a picture to make a file of. */
+  get isThere(): boolean {
+    return this.#renderer.hasPicture;
   }
 
   set fps(fps: number | undefined) {

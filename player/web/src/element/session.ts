@@ -223,19 +223,30 @@ export class Session {
     });
   }
 
-  /** Return the picture as a file, once it is as fine as it will be; while the clip plays, at once. */
+  /** Whether the card was lost, and nothing has been drawn since. */
+  get #isGone(): boolean {
+    return this.isShown && this.#picture?.isThere === false;
+  }
+
+  /**
+   * Return the picture as a file, once it is as fine as it will be; while the clip plays, at once, or once a lost card
+   * is back.
+   */
   async toBlob(type: string, quality?: number): Promise<Blob> {
     const { clock } = this.#options;
     this.#isSharp = false; // a view or a time may have been set since the last frame
     this.#askers++;
-    for (let frames = 0; frames < 600 && clock.paused && !this.#isClosed; frames++) {
+    for (let frames = 0; frames < 600 && (clock.paused || this.#isGone) && !this.#isClosed; frames++) {
       this.wake();
       await new Promise(requestAnimationFrame);
-      if (clock.isSeeking && this.clip?.error === null) frames = 0;
-      else if (this.#isSharp) break;
+      if ((clock.isSeeking || this.#isGone) && this.clip?.error === null) frames = 0;
+      else if (this.#isSharp || this.#isGone) break;
     }
     this.#askers--;
-    if (this.#picture === null || !this.isShown) throw new DOMException('there is no picture yet', 'InvalidStateError');
+    if (this.#picture === null || !this.isShown || this.#isGone) {
+      const why = this.#isClosed ? 'the scene was removed before its picture was there' : 'there is no picture yet';
+      throw new DOMException(why, 'InvalidStateError');
+    }
     return this.#picture.toBlob(type, quality);
   }
 

@@ -138,6 +138,11 @@ export class Renderer {
     return this.gl.isContextLost();
   }
 
+  /** Whether there is a picture to present: none after the card was lost, until the next one is whole. */
+  get hasPicture(): boolean {
+    return !this.isLost && this.#shown !== null;
+  }
+
   /** Whether the card is not done yet with the picture before; until then `draw` does nothing. */
   get isBusy(): boolean {
     return this.#timer.isBusy;
