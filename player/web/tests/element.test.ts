@@ -141,8 +141,26 @@ test('a link says time, camera and player, and keeps what else the hash says', (
   assert.equal(momentOf(hash, 'two', true), null);
   assert.equal(
     linkTo('https://a.example/#top', { time: null, camera: 'front' }, ''),
-    'https://a.example/#camera=front',
+    'https://a.example/#top&camera=front',
   );
+});
+
+test('a link keeps the path of a router in the hash', () => {
+  for (const [hash, linked] of [
+    ['', '#t=2&camera=1,2,3,4,5,6'],
+    ['#/', '#/?t=2&camera=1,2,3,4,5,6'],
+    ['#/scenes/3', '#/scenes/3?t=2&camera=1,2,3,4,5,6'],
+    ['#!/scenes/3?x=%C3%BC&y&t=1', '#!/scenes/3?x=%C3%BC&y&t=2&camera=1,2,3,4,5,6'],
+    ['#/a=b?camera=left', '#/a=b?t=2&camera=1,2,3,4,5,6'],
+    ['#top&t=5&t', '#top&t=2&camera=1,2,3,4,5,6'],
+  ]) {
+    const moment = { time: 2, camera: '1,2,3,4,5,6' };
+    const link = linkTo(`https://a.example/b${hash}`, moment, '');
+    assert.equal(link, `https://a.example/b${linked}`);
+    assert.equal(linkTo(link, moment, ''), link);
+    assert.deepEqual(momentOf(new URL(link).hash, '', true), moment);
+  }
+  assert.equal(momentOf('#/scenes/3', '', true), null);
 });
 
 test('a link without a player is for the first one, and odd values count as none', () => {

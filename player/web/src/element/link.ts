@@ -1,4 +1,7 @@
-/** Links to a moment seen from a place: `#t=1.5&camera=...`, in the page's hash as media fragments are. */
+/**
+ * Links to a moment seen from a place: `#t=1.5&camera=...`, in the page's hash as media fragments are, or behind the
+ * path of a router that keeps it there: `#/scenes/3?t=1.5&camera=...`.
+ */
 
 export interface Moment {
   /** Seconds. */
@@ -7,24 +10,31 @@ export interface Moment {
   camera: string | null;
 }
 
+/** Return the path that a router of the page keeps in a hash, if it does, and what names and values there are. */
+function partsOf(hash: string): [string, string] {
+  const [, path = '', values = ''] = /^#?(!?\/[^?]*)?\??(.*)$/s.exec(hash) ?? [];
+  return [path, values];
+}
+
 /**
  * Return an address that shows a moment in the player with an id, or in the page's only one.
- * What else the hash says is kept, if it is made of names and values, too.
+ * What else the hash says is kept.
  */
 export function linkTo(address: string, moment: Moment, id: string): string {
   const url = new URL(address);
-  const values = new URLSearchParams(url.hash.includes('=') ? url.hash.slice(1) : '');
-  for (const name of ['t', 'camera', 'player']) values.delete(name);
+  const [path, before] = partsOf(url.hash);
+  const kept = before.split('&').filter((value) => value !== '' && !/^(t|camera|player)(=|$)/.test(value));
+  const values = new URLSearchParams();
   if (moment.time !== null) values.set('t', String(Number(moment.time.toFixed(3))));
   if (moment.camera !== null) values.set('camera', moment.camera.replace(/\s+/g, ','));
   if (id !== '') values.set('player', id);
-  url.hash = values.toString().replaceAll('%2C', ',');
+  url.hash = `${path && `${path}?`}${[...kept, values.toString().replaceAll('%2C', ',')].join('&')}`;
   return url.href;
 }
 
 /** Return the moment that a hash says for a player; null if it says none, or for another player. */
 export function momentOf(hash: string, id: string, isFirst: boolean): Moment | null {
-  const values = new URLSearchParams(hash.replace(/^#/, ''));
+  const values = new URLSearchParams(partsOf(hash)[1]);
   const player = values.get('player');
   if (player === null ? !isFirst : player !== id) return null;
   const text = values.get('t');
