@@ -1,3 +1,3 @@
 /** What `kpc-player/three` exports. */
 
-export { KpcObject, type KpcObjectOptions } from './kpc_object.js';
+export { KpcObject, type KpcObjectEventMap, type KpcObjectOptions } from './kpc_object.js';

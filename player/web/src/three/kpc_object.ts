@@ -14,6 +14,7 @@ import {
   type Camera,
   Mesh,
   MeshBasicMaterial,
+  type Object3DEventMap,
   type Scene,
   Vector3,
   Vector4,
@@ -53,7 +54,10 @@ interface Drawing {
 
 type Events = ClockEvent | 'loadedmetadata' | 'canplay' | 'error';
 
-export class KpcObject extends Mesh<BoxGeometry, MeshBasicMaterial> {
+/** What may be listened for; events hold nothing but their names. */
+export type KpcObjectEventMap = Object3DEventMap & Record<Events, object>;
+
+export class KpcObject extends Mesh<BoxGeometry, MeshBasicMaterial, KpcObjectEventMap> {
   quality: Level | 'auto';
   appearance: string;
   /** The clip, once its header has arrived. */
@@ -231,7 +235,7 @@ export class KpcObject extends Mesh<BoxGeometry, MeshBasicMaterial> {
   }
 
   #emit(type: Events): void {
-    (this.dispatchEvent as (event: { type: string }) => void).call(this, { type });
+    this.dispatchEvent({ type });
   }
 }
 
