@@ -213,6 +213,25 @@ scenario('reflects attributes and properties', async () => {
   await close(page);
 });
 
+scenario('takes every property that was set before it was defined', async () => {
+  const page = await open('<kpc-player></kpc-player>');
+  const got = await player(page, (it) => {
+    // Elements of such documents are defined once they are in a page.
+    const early = document.implementation.createHTMLDocument('').createElement('kpc-player');
+    const names = [];
+    for (let type = Object.getPrototypeOf(it); type !== HTMLElement.prototype; type = Object.getPrototypeOf(type)) {
+      for (const [name, { set }] of Object.entries(Object.getOwnPropertyDescriptors(type))) if (set) names.push(name);
+    }
+    for (const name of names) early[name] = it[name];
+    Object.assign(early, { shownPart: 'static', keepsLimits: false, unknown: 1 });
+    document.body.append(early);
+    return { names, own: Object.getOwnPropertyNames(early), set: [early.shownPart, early.keepsLimits] };
+  });
+  assert.ok(got.names.length >= 20 && got.names.includes('srcObject'));
+  assert.deepEqual([got.own, got.set], [['unknown'], ['static', false]]);
+  await close(page);
+});
+
 scenario('seeks in a long clip, where nothing has arrived', async () => {
   const page = await open(TAG.replace('scene.kpc', 'slow/long.kpc'));
   await shown(page);

@@ -92,7 +92,7 @@ test('a value that is refused does not keep an element from its other values', (
   const player = new Player();
   Object.defineProperty(player, 'volume', { value: 'x', configurable: true, writable: true });
   Object.defineProperty(player, 'loop', { value: 1, configurable: true, writable: true });
-  upgrade(player, ['volume', 'loop']);
+  upgrade(player);
   assert.deepEqual([player.volume, player.loop], [1, true]);
   assert.match(String(logged.mock.calls[0].arguments[0]), /volume must be a finite number/);
 });

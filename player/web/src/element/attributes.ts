@@ -30,10 +30,10 @@ export function setFlag(element: HTMLElement, name: string, value: unknown): voi
  * What a page set before the element was defined is set again, now that it has setters. One that is refused must not
  * keep the scene from being loaded.
  */
-export function upgrade(element: HTMLElement, names: readonly string[]): void {
+export function upgrade(element: HTMLElement): void {
   const values = element as unknown as Record<string, unknown>;
-  for (const name of names) {
-    if (!Object.hasOwn(element, name)) continue;
+  for (const name of Object.getOwnPropertyNames(element)) {
+    if (!(name in Object.getPrototypeOf(element))) continue;
     const value = values[name];
     delete values[name];
     try {

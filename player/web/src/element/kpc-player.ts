@@ -18,10 +18,6 @@ import { type PlayerRanges, rangesOf } from './ranges.js';
 import { Session } from './session.js';
 import { blobOrNull, cameraText, finite } from './values.js';
 
-const PROPERTIES = [
-  ...['src', 'srcObject', 'poster', 'controls', 'autoplay', 'loop', 'muted', 'playsInline', 'preload', 'currentTime'],
-  ...['playbackRate', 'volume', 'camera', 'cameraControls', 'quality', 'targetFps', 'appearance', 'memory'],
-];
 /** Milliseconds between two `progress` events. */
 const PROGRESS_MS = 350;
 const HAVE_FUTURE_DATA = 3;
@@ -83,7 +79,7 @@ export class KpcPlayer extends AudibleElement implements Model {
   }
 
   connectedCallback(): void {
-    upgrade(this, PROPERTIES);
+    upgrade(this);
     connected.add(this);
     window.addEventListener('hashchange', this.#followLink);
     this.#ui.setPoster(this.poster);
