@@ -318,6 +318,25 @@ test('a damaged chunk is fetched again, and reported if it stays so', async () =
   });
 });
 
+test('a file that is replaced while its server says nothing of it is no damaged file', async () => {
+  const group = scene({ ...SHORT, frameCount: 101, segmentRows: 32 });
+  const { valueCount } = new Container(group).header;
+  const clipFile = grouped([group, group, group], 101, 1, valueCount);
+  for (const other of [grouped([LONG, LONG], 101, 1, valueCount), LONG, clipFile.subarray(0, 5000).toReversed()]) {
+    await withServer(clipFile, { etag: null, saysRange: false }, async (server) => {
+      await withClip(server.url, { position: { time: 0, isPreview: true } }, async (clip) => {
+        server.bytes = other;
+        const time = 0.9 * clip.duration;
+        const jump = until(clip, () => {
+          clip.setPlayhead({ time });
+          return clip.canShow(time);
+        });
+        await assert.rejects(jump, hasCode('replaced'));
+      });
+    });
+  }
+});
+
 test('a file that is cut off plays as far as it goes', async () => {
   const { index } = new Container(LONG);
   const cut = LONG.slice(0, index[40].offset + 10);

@@ -180,6 +180,13 @@ test('notices that the file was replaced', async () => {
     await assert.rejects(source.read(160_000, 170_000), hasCode('replaced'));
     source.close();
   });
+  await withServer(BYTES, { etag: null, saysRange: false }, async (server) => {
+    const source = await HttpSource.open(server.url, FAST);
+    await source.read(100_000, 150_000, { fresh: true }); // of which some came damaged
+    server.bytes = other;
+    await assert.rejects(source.read(100_000, 150_000, { fresh: true }), hasCode('replaced'));
+    source.close();
+  });
   await withServer(BYTES, { hasRanges: false, cuts: [90_000] }, async (server) => {
     const source = await HttpSource.open(server.url, FAST);
     Object.assign(server, { bytes: other, etag: null });

@@ -5,6 +5,7 @@
  * long the clip is.
  */
 
+import { HEADER_LENGTH } from '../container/container.js';
 import { asKpcError, BudgetError, FormatError, KpcError } from '../container/errors.js';
 import { checkGroup } from '../container/groups.js';
 import type { Metadata } from '../container/metadata.js';
@@ -455,13 +456,12 @@ async function openGroup(
 ): Promise<SceneStream> {
   const file = files[group];
   if (file.size === 0 && shared) throw pictureError();
-  const scene = await SceneStream.open(file, pool, {
-    group,
-    shared,
-    memory,
-    changed,
-    signal,
-    check: ({ head }) => check(group, head),
+  const options = { group, shared, memory, changed, signal };
+  const opening = SceneStream.open(file, pool, { ...options, check: ({ head }) => check(group, head) });
+  const scene = await opening.catch(async (error) => {
+    // A server may hide that the file was replaced, until it is asked once more.
+    if (error instanceof FormatError) await file.read(0, HEADER_LENGTH, { signal, fresh: true });
+    throw error;
   });
   if (!scene.lacksPicture) return scene;
   scene.close();

@@ -169,6 +169,7 @@ export class HttpSource implements Source {
     if (response.status === 416) {
       if (this.size !== null && start < this.size) throw this.#replaced();
       if (this.size !== null) return null; // it has become known since the request was sent
+      if (this.#beginning.length > 0 && !(await this.#isSame(response, true))) throw this.#replaced();
       if (size === 0) throw emptyError(this.name);
       if (size !== null && size < end) {
         this.size = size;
@@ -186,7 +187,7 @@ export class HttpSource implements Source {
     }
     if (size !== null && this.size !== null && size !== this.size) throw this.#replaced();
     if (this.#beginning.length === 0) this.#validator = validatorOf(response);
-    else if (!(await this.#isSame(response))) throw this.#replaced();
+    else if (!(await this.#isSame(response, fresh))) throw this.#replaced();
     this.size ??= size;
     return response;
   }
@@ -245,11 +246,13 @@ export class HttpSource implements Source {
     return blocked(`its server must permit this page to read it, by the header Access-Control-Allow-Origin: ${origin}`);
   }
 
-  /** Whether an answer is of the file that was opened, as far as the server says. */
-  async #isSame(response: Response): Promise<boolean> {
-    const [name, value] = this.#validator ?? ['', ''];
-    const isSame = this.#validator === null || (response.headers.get(name) ?? value) === value;
-    if (isSame) return true;
+  /**
+   * Whether an answer is of the file that was opened, as far as the server says. If bytes came damaged, which makes it
+   * doubtful, a server that says nothing is asked for the beginning.
+   */
+  async #isSame(response: Response, isDoubtful = false): Promise<boolean> {
+    const said = this.#validator && response.headers.get(this.#validator[0]);
+    if (said === null ? !isDoubtful : said === this.#validator?.[1]) return true;
     // Nodes of a server may have ETags and dates of their own: then the beginning says whether it is the file.
     const known = this.#beginning.subarray(0, BEGINNING_BYTES);
     const connection = new Connection([this.#closing.signal], this.#options.timeoutMs);
