@@ -65,18 +65,19 @@ class Faulty(Handler):
         self.path, self.is_shared = f"/{rest}", self.fault != "refused"
         with self.lock:
             self.count = self.requests[self.fault] = self.requests.get(self.fault, 0) + 1
-        if self.fault == "moved":
+        if self.fault in ("moved", "away"):
+            site = "" if self.fault == "moved" else f"http://localhost:{self.server.server_address[1]}/refused"
             self.send_response(HTTPStatus.FOUND)
-            self.send_header("Location", self.path)
+            self.send_header("Location", site + self.path)
             self.send_header("Content-Length", "0")
             self.end_headers()
             return
         if self.fault == "replaced" and self.count > 1:
             self.path = "/other.kpc"
-        if self.fault in ("whole", "packed"):
+        if self.fault == "whole":
             del self.headers["Range"]
-        # Browsers that ask for a range accept nothing compressed.
-        if self.fault == "packed" and "gzip" in self.headers.get("Accept-Encoding", ""):
+        # Browsers that ask for a range accept nothing compressed, and refuse this answer.
+        if self.fault == "packed":
             packed = gzip.compress(Path(self.translate_path(self.path)).read_bytes())
             self.answer_with(packed, "Content-Encoding", "gzip")
             return

@@ -211,6 +211,7 @@ test('every kind of error is a sentence', () => {
   );
   const messageOf = (code: 'blocked' | 'not-found', src: string) =>
     playerErrorOf(new KpcError('x', code), src, 'https://c.example').message;
+  assert.match(messageOf('blocked', 'https://c.example/a.kpc'), /^The address leads to another server, which does/);
   assert.match(messageOf('blocked', 'file:///home/a.kpc'), /^A page cannot read files of a disk\..*\.$/);
   assert.match(messageOf('not-found', 'ftp://a.example/b.kpc'), /^A page cannot fetch .* "ftp:"\..*\.$/);
   assert.match(messageOf('not-found', 'http://['), /^There is no such file/);

@@ -20,6 +20,8 @@ const EVENTS = [
 const [address, executablePath, folder, ...chosen] = process.argv.slice(2);
 const scenarios = new Map();
 const scenario = (name, run) => scenarios.set(name, run);
+/** The same server as another site. */
+const otherSite = address.replace('127.0.0.1', 'localhost');
 const browser = await chromium.launch({ executablePath, args: FLAGS });
 
 function noteErrors(page) {
@@ -566,13 +568,14 @@ const WRONG = {
   'draft.kpc': ['draft', /draft version/],
   'half.kpc': ['damaged', /^The file is damaged\. Its owner/],
   'stub.kpc': ['cut-off', /incomplete/],
-  'refused/scene.kpc': ['blocked', /Access-Control-Allow-Origin: http:\/\/127/],
+  'refused/scene.kpc': ['blocked', /^The server localhost:\d+ .* Access-Control-Allow-Origin: http:\/\/127/],
+  'away/scene.kpc': ['blocked', /^The address leads to another server, .* Access-Control-Allow-Origin: http:\/\/127/],
 };
 
 for (const [src, [code, words]] of Object.entries(WRONG)) {
-  scenario(`says what is wrong: ${code}`, async () => {
+  scenario(`says what is wrong of ${src}: ${code}`, async () => {
     // The refusing server is another site.
-    const full = src.startsWith('refused') ? `${address.replace('127.0.0.1', 'localhost')}/${src}` : src;
+    const full = src.startsWith('refused') ? `${otherSite}/${src}` : src;
     const page = await open(TAG.replace('scene.kpc', full));
     await until(page, (it) => it.error !== null);
     const { error, isRejected } = await player(page, async (it) => {
@@ -714,7 +717,7 @@ scenario('draws with less memory where the card has little, and says so where it
 
 scenario('plays from servers that are slow, cut files short, know no ranges, compress and redirect', async () => {
   const page = await open('<kpc-player quality="fastest" muted></kpc-player>');
-  for (const fault of ['slow', 'cut', 'whole', 'packed', 'moved']) {
+  for (const fault of ['slow', 'cut', 'whole', 'packed', `${otherSite}/packed`, 'moved']) {
     const state = await player(
       page,
       (it, src) => {

@@ -195,12 +195,39 @@ test('notices that the file was replaced', async () => {
   });
 });
 
+test('asks for the whole file where no range is answered', async () => {
+  const global = globalThis as { location?: unknown };
+  global.location = { origin: 'https://page.example', href: 'https://page.example/', protocol: 'https:' };
+  const rangeless = (failures: number) => (input: RequestInfo | URL, init?: RequestInit) =>
+    new Headers(init?.headers).has('Range') && failures-- > 0
+      ? Promise.reject(new TypeError('Failed to fetch'))
+      : fetch(input, { ...init, mode: 'cors' });
+  try {
+    await withServer(BYTES, { hasRanges: false, isCompressed: true }, async (server) => {
+      const fetching = { ...FAST, fetch: rangeless(Infinity) as typeof fetch };
+      const source = await HttpSource.open(server.url, fetching);
+      await works(source);
+      assert.deepEqual([source.hasRanges, server.requests], [false, ['all']]);
+      source.close();
+      await assert.rejects(HttpSource.open(server.url, { ...fetching, limit: 10_000 }), hasCode('budget'));
+    });
+    await withServer(BYTES, {}, async (server) => {
+      const source = await HttpSource.open(server.url, { ...FAST, fetch: rangeless(1) as typeof fetch });
+      assert.equal(source.hasRanges, true); // one failure is one of the connection
+      source.close();
+    });
+  } finally {
+    delete global.location;
+  }
+});
+
 test('says that another site does not permit the page to read', async () => {
   const global = globalThis as { location?: unknown };
   global.location = { origin: 'https://page.example', href: 'https://page.example/', protocol: 'https:' };
+  let isOpaque = false;
   const refusing = (answers: boolean) => (_: unknown, init?: RequestInit) =>
     init?.mode === 'no-cors' && answers
-      ? Promise.resolve(new Response(null))
+      ? Promise.resolve(Object.defineProperty(new Response(null), 'type', { value: isOpaque ? 'opaque' : 'basic' }))
       : Promise.reject(new TypeError('Failed to fetch'));
   try {
     const open = (url: string, answers: boolean) =>
@@ -210,6 +237,8 @@ test('says that another site does not permit the page to read', async () => {
     await assert.rejects(open('http://files.example/scene.kpc', false), hasCode('blocked', 'https'));
     await assert.rejects(open('https://files.example/scene.kpc', false), hasCode('network'));
     await assert.rejects(open('https://page.example/scene.kpc', true), hasCode('network'));
+    isOpaque = true; // as after a redirection to another site
+    await assert.rejects(open('https://page.example/scene.kpc', true), hasCode('blocked', 'its address leads to'));
     for (const odd of ['ftp://files.example/scene.kpc', 'about:blank', 'javascript:0', 'c:\\scene.kpc']) {
       await assert.rejects(open(odd, false), hasCode('not-found', 'cannot fetch such addresses'));
     }

@@ -38,7 +38,7 @@ function sentenceOf(code: PlayerErrorCode, detail: string, src: string, origin: 
         : `A page cannot fetch addresses that begin with "${strangeScheme(src)}". Use one that begins with "https:".`;
     case 'blocked':
       if (src.startsWith('file:')) return 'A page cannot read files of a disk. Open the file by kpplay --web instead.';
-      return `The server ${hostOf(src)} does not let this page read the file. Its answers need the header Access-Control-Allow-Origin: ${origin}`;
+      return `${serverOf(src, origin)} does not let this page read the file. Its answers need the header Access-Control-Allow-Origin: ${origin}`;
     case 'network':
       return 'The file cannot be fetched. Check the connection, then try again.';
     case 'replaced':
@@ -69,10 +69,12 @@ function sentenceOf(code: PlayerErrorCode, detail: string, src: string, origin: 
   }
 }
 
-function hostOf(src: string): string {
+/** Return what refuses a page of an origin to read from an address. */
+function serverOf(src: string, origin: string): string {
   try {
-    return new URL(src).host;
+    const url = new URL(src);
+    return url.origin === origin ? 'The address leads to another server, which' : `The server ${url.host}`;
   } catch {
-    return 'of the file';
+    return 'The server of the file';
   }
 }

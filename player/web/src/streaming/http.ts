@@ -24,6 +24,8 @@ export const FIRST_BYTES = 1 << 16;
 const BEGINNING_BYTES = 512;
 /** Requests that may fail in a row, until `attempts` is set. */
 const MAX_ATTEMPTS = 5;
+/** Failures without an answer after which the whole file is asked for, since the server may have no ranges. */
+const WHOLE_AFTER = 2;
 /** The pause before the second request, and the longest pause. Each is multiplied by a random number in [1/2, 3/2]. */
 const FIRST_PAUSE_MS = 250;
 const MAX_PAUSE_MS = 8000;
@@ -67,6 +69,8 @@ export class HttpSource implements Source {
   #beginning = new Uint8Array(0);
   #whole: Whole | null = null;
   #isRetrying = false;
+  /** Requests that failed without an answer before there was any. */
+  #refusals = 0;
 
   private constructor(url: string, options: HttpOptions) {
     this.#given = this.#address = url;
@@ -200,7 +204,11 @@ export class HttpSource implements Source {
     try {
       response = await send(this.#address, request);
     } catch (error) {
-      throw connection.failure(this.receivedBytes === 0 ? await this.#blockade() : null, error);
+      if (this.receivedBytes > 0 || connection.signal.aborted) throw connection.failure(null, error);
+      this.#refusals++;
+      // Hosts that compress whatever is asked for: browsers refuse that in answer to a range, and to nothing else.
+      if (this.#refusals === WHOLE_AFTER && 'Range' in headers) return this.#send(connection, {}, fresh);
+      throw connection.failure(await this.#blockade(), error);
     }
     connection.touch();
     const { status } = response;
@@ -230,7 +238,8 @@ export class HttpSource implements Source {
     if (location === undefined) return null;
     const blocked = (why: string) => new KpcError(`${this.name}: ${why}`, 'blocked');
     if (url.protocol === 'file:') return blocked('a page cannot read files of a disk; serve them: kpplay --web');
-    if (url.origin === location.origin) return null;
+    if (this.#refusals < WHOLE_AFTER) return null; // it may be the connection, or that the server has no ranges
+    const isOwn = url.origin === location.origin;
     try {
       const send = this.#options.fetch ?? globalThis.fetch;
       const probe = await send(url.href, {
@@ -238,12 +247,14 @@ export class HttpSource implements Source {
         signal: AbortSignal.timeout(this.#options.timeoutMs ?? 5000),
       });
       await probe.body?.cancel();
+      if (isOwn && probe.type !== 'opaque') return null; // it was not redirected to another site
     } catch {
       const isMixed = location.protocol === 'https:' && url.protocol === 'http:';
       return isMixed ? blocked('a page that came by https cannot read by http; serve the file by https') : null;
     }
     const origin = location.origin === 'null' ? '*' : location.origin;
-    return blocked(`its server must permit this page to read it, by the header Access-Control-Allow-Origin: ${origin}`);
+    const server = isOwn ? 'the server that its address leads to' : 'its server';
+    return blocked(`${server} must permit this page to read it, by the header Access-Control-Allow-Origin: ${origin}`);
   }
 
   /**
