@@ -111,6 +111,40 @@ async function pictures(cameras) {
   return found;
 }
 
+/** In the page: return what is wrong with a clip that is treated as all meshes are. */
+async function treated() {
+  const THREE = await import('three');
+  const { KpcObject } = await import('kpc-player/three');
+  const actor = new KpcObject('scene.kpc', { quality: 'fine', loop: true });
+  actor.position.set(1, 2, 3);
+  actor.add(new THREE.Group());
+  new THREE.Scene().add(actor).traverse((object) => Object.assign(object, { castShadow: true, receiveShadow: true }));
+  actor.currentTime = 0.5;
+  const clone = actor.clone();
+  await new Promise((resolve) => {
+    clone.addEventListener('loadedmetadata', resolve);
+    clone.addEventListener('error', resolve);
+  });
+  const sentenceOf = (make) => {
+    try {
+      make();
+    } catch (error) {
+      return error.message;
+    }
+  };
+  const found = {
+    shadows: [actor.castShadow, actor.receiveShadow, actor.children[0].castShadow],
+    clone: [clone.error?.message, clone.position.z, clone.quality, clone.loop, clone.children.length],
+    isItself: clone instanceof KpcObject && clone.geometry !== actor.geometry && clone.material !== actor.material,
+    time: clone.currentTime,
+    odd: [() => new KpcObject('scene.kpc', { quality: 'nope' }), () => Object.assign(actor, { quality: '' })].map(
+      sentenceOf,
+    ),
+  };
+  for (const object of [actor, clone]) object.dispose();
+  return found;
+}
+
 export function threeScenarios(scenario, browser, address, folder) {
   async function open(path) {
     const context = await browser.newContext({ viewport: { width: 320, height: 240 } });
@@ -126,13 +160,30 @@ export function threeScenarios(scenario, browser, address, folder) {
     await page.context().close();
   }
 
-  scenario('draws a clip among meshes of three.js', async () => {
+  const openEmpty = () => {
     const html = `<!doctype html><title>Test</title><script type="importmap">${JSON.stringify({ imports: IMPORTS })}</script>`;
-    const page = await open(`page.html?${encodeURIComponent(html)}`);
-    const found = await page.evaluate(`(${pictures})(${JSON.stringify(CAMERAS)})`);
+    return open(`page.html?${encodeURIComponent(html)}`);
+  };
+
+  scenario('is treated as all meshes of three.js', async () => {
+    const shown = await openEmpty();
+    const { odd, ...found } = await shown.evaluate(treated);
+    assert.deepEqual(found, {
+      shadows: [false, false, true],
+      clone: [undefined, 3, 'fine', true, 1],
+      isItself: true,
+      time: 0.5,
+    });
+    for (const sentence of odd) assert.match(sentence, /^quality must be one of auto, fastest, .*reference, not /);
+    await close(shown);
+  });
+
+  scenario('draws a clip among meshes of three.js', async () => {
+    const shown = await openEmpty();
+    const found = await shown.evaluate(`(${pictures})(${JSON.stringify(CAMERAS)})`);
     assert.equal(found.message, null);
     assert.ok(found.begun > 0, 'a time that was set before the clip was there is forgotten');
-    await close(page);
+    await close(shown);
     return found;
   });
 

@@ -26,6 +26,7 @@ import {
   ClipScenes,
   Clock,
   type ClockEvent,
+  LEVEL_NAMES,
   type Level,
   Renderer,
   type SceneEvent,
@@ -58,7 +59,6 @@ type Events = ClockEvent | 'loadedmetadata' | 'canplay' | 'error';
 export type KpcObjectEventMap = Object3DEventMap & Record<Events, object>;
 
 export class KpcObject extends Mesh<BoxGeometry, MeshBasicMaterial, KpcObjectEventMap> {
-  quality: Level | 'auto';
   appearance: string;
   /** The clip, once its header has arrived. */
   clip: Clip | null = null;
@@ -66,7 +66,9 @@ export class KpcObject extends Mesh<BoxGeometry, MeshBasicMaterial, KpcObjectEve
   error: Error | null = null;
   /** The box that the scene fills; what lies around it, if anything, is shown, too. */
   readonly box = new Box3();
+  readonly #src: string | URL | Blob;
   readonly #options: KpcObjectOptions;
+  #quality: Level | 'auto' = 'auto';
   readonly #clock = new Clock((event) => this.#emit(event));
   readonly #opening = new AbortController();
   #drawing: Drawing | null = null;
@@ -80,13 +82,27 @@ export class KpcObject extends Mesh<BoxGeometry, MeshBasicMaterial, KpcObjectEve
   constructor(src: string | URL | Blob, options: KpcObjectOptions = {}) {
     const nothing = { transparent: true, colorWrite: false, depthWrite: false, depthTest: false };
     super(new BoxGeometry(), new MeshBasicMaterial(nothing));
-    this.#options = options;
+    [this.#src, this.#options] = [src, options];
+    // Its box would cast a shadow where a page has all meshes cast some.
+    for (const name of ['castShadow', 'receiveShadow']) {
+      Object.defineProperty(this, name, { get: () => false, set: () => {} });
+    }
     this.quality = options.quality ?? 'auto';
     this.appearance = options.appearance ?? '';
     this.#clock.loop = options.loop ?? false;
     this.frustumCulled = false; // time goes on and planes arrive while it is out of sight
     this.onBeforeRender = this.#draw;
     this.#open(src);
+  }
+
+  get quality(): Level | 'auto' {
+    return this.#quality;
+  }
+
+  set quality(value: Level | 'auto') {
+    const names = ['auto', ...LEVEL_NAMES];
+    if (!names.includes(value)) throw new TypeError(`quality must be one of ${names.join(', ')}, not ${value}`);
+    this.#quality = value;
   }
 
   get currentTime(): number {
@@ -134,6 +150,15 @@ export class KpcObject extends Mesh<BoxGeometry, MeshBasicMaterial, KpcObjectEve
 
   pause(): void {
     this.#clock.pause();
+  }
+
+  /** Return another object that plays the same file, from the same time on. */
+  override clone(recursive?: boolean): this {
+    const { quality, appearance, loop, currentTime, playbackRate } = this;
+    const options = { ...this.#options, quality, appearance, loop };
+    const clone = new (this.constructor as typeof KpcObject)(this.#src, options) as this;
+    const { geometry, material } = clone; // each disposes of its own
+    return Object.assign(clone.copy(this, recursive), { geometry, material, currentTime, playbackRate });
   }
 
   /** Give everything back; remove it from its scene, too. */
