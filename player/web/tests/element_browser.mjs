@@ -941,6 +941,37 @@ for (const [name, context] of Object.entries(SCREENS)) {
   });
 }
 
+scenario('can be seen in the colours that a user forces', async () => {
+  const page = await open(TAG, { context: { forcedColors: 'active' } });
+  await shown(page);
+  const colours = await inside(page, '.bar').evaluate((bar) => {
+    const [play, bare] = ['.button', '.track'].map((name) => getComputedStyle(bar.querySelector(name)));
+    return [play.color, getComputedStyle(bar).backgroundColor, bare.backgroundColor];
+  });
+  assert.equal(new Set(colours).size, 3);
+  for (const colour of colours) assert.match(colour, /^rgb\(/); // none is seen through
+  await page.screenshot({ path: join(folder, 'forced.png') });
+  await close(page);
+});
+
+scenario('works where Trusted Types let workers pass, and says so where they do not', async () => {
+  const csp = "require-trusted-types-for 'script'";
+  const page = await open(TAG, { csp });
+  await until(page, (it) => it.error?.code === 'worker');
+  assert.match(
+    await player(page, (it) => it.error.message),
+    /Trusted Types, if it demands them, need a default policy/,
+  );
+  await close(page);
+  const permitting = await open(TAG, {
+    csp,
+    before: (it) =>
+      it.addInitScript(() => trustedTypes.createPolicy('default', { createScriptURL: (address) => address })),
+  });
+  await shown(permitting);
+  await close(permitting);
+});
+
 scenario('can be used without a mouse', async () => {
   const page = await open(WIDE);
   await shown(page);
@@ -950,7 +981,7 @@ scenario('can be used without a mouse', async () => {
     labels.push(await player(page, (it) => it.shadowRoot.activeElement?.ariaLabel ?? 'none'));
   }
   assert.match(labels[0], /^A corner of a room\. Drag/);
-  const names = ['Play', 'Time', 'Play', 'Views', 'Settings', 'Copy link here and now', 'Fill the screen'];
+  const names = ['Play the scene', 'Time', 'Play', 'Views', 'Settings', 'Copy link here and now', 'Fill the screen'];
   assert.deepEqual(labels.slice(1), names);
   await close(page);
 });

@@ -231,7 +231,9 @@ export class DecoderPool {
       return;
     }
     if (this.#slots.some((other) => other.state !== 'none')) return;
-    const advice = "the page's Content-Security-Policy must allow worker-src blob: and script-src 'wasm-unsafe-eval'";
+    const advice =
+      "the page's Content-Security-Policy must allow worker-src blob: and script-src 'wasm-unsafe-eval', " +
+      'and Trusted Types, if it demands them, need a default policy that lets scripts of workers pass';
     const jobs = this.#queue;
     this.#queue = [];
     for (const job of jobs) {

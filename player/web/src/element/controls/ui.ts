@@ -85,7 +85,10 @@ export class Ui {
     this.#actions = actions;
     root.adoptedStyleSheets = [sheet()];
     this.stage = make('div', { class: 'stage', part: 'stage', tabindex: 0, role: 'application' });
-    this.#large = new IconButton('play', 'Play', () => commands.playOrPause(), { class: 'large', hidden: true });
+    this.#large = new IconButton('play', 'Play the scene', () => commands.playOrPause(), {
+      class: 'large',
+      hidden: true,
+    });
     this.#play = new IconButton('play', 'Play', () => commands.playOrPause());
     this.#fill = new IconButton('fill', 'Fill the screen', () => commands.toggleFullscreen());
     this.#timeline = new Timeline(actions);
