@@ -5,6 +5,7 @@ import threading
 import webbrowser
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 from urllib.parse import urlsplit
@@ -20,7 +21,7 @@ from kpc.player.sharing.file_server import Handler, serving
 from kpc.player.sharing.site import SharedScene
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 
 class _Handler(Handler):
@@ -28,6 +29,15 @@ class _Handler(Handler):
 
     is_shared = False
     elsewhere: ClassVar[Mapping[str, Path]] = {}
+
+    def answer_request(self, answer_folder: "Callable[[], None]") -> None:
+        """Answer a request that names this machine: a page whose name was made to lead here could read the files."""
+        names = ("localhost", "127.0.0.1", "[::1]")
+        host, port = self.headers.get("Host", ""), self.connection.getsockname()[1]
+        if host.lower() in [f"{name}:{port}" for name in names]:
+            super().answer_request(answer_folder)
+        else:
+            self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
 
     def translate_path(self, path: str) -> str:
         """Return the file that a request means."""

@@ -3,6 +3,7 @@
 import hashlib
 import re
 import shutil
+import urllib.error
 import urllib.request
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -371,6 +372,19 @@ def test_a_browser_gets_page_player_and_scene(tmp_path: Path) -> None:
         assert "javascript" in types["kpc-player.js"] and "text/css" in types["page.css"]
         part, headers = read(url + "a-b-c8687a08.kpc", Range="bytes=4-9")
         assert part == SAMPLE.read_bytes()[4:10] and headers["content-range"] == f"bytes 4-9/{SAMPLE.stat().st_size}"
+
+
+@pytest.mark.parametrize(
+    "host", ["a.example", "a.example:{port}", "127.0.0.1", "localhost:1", "127.0.0.1.a.example:{port}"]
+)
+def test_names_that_were_made_to_lead_here_are_refused(host: str) -> None:
+    with serving_pages([str(SAMPLE)]) as url:
+        port = url.rstrip("/").rpartition(":")[2]
+        for name in "localhost", "LOCALHOST", "127.0.0.1", "[::1]":
+            assert read(url, Host=f"{name}:{port}")[0]
+        for path in "", "default.kpc":
+            with pytest.raises(urllib.error.HTTPError, match="421"):
+                read(url + path, Host=host.format(port=port))
 
 
 def test_a_folder_is_played_without_what_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
