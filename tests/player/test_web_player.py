@@ -66,7 +66,7 @@ class Faulty(Handler):
         with self.lock:
             self.count = self.requests[self.fault] = self.requests.get(self.fault, 0) + 1
         if self.fault in ("moved", "away"):
-            site = "" if self.fault == "moved" else f"http://localhost:{self.server.server_address[1]}/refused"
+            site = "" if self.fault == "moved" else f"http://localhost:{self.connection.getsockname()[1]}/refused"
             self.send_response(HTTPStatus.FOUND)
             self.send_header("Location", site + self.path)
             self.send_header("Content-Length", "0")
