@@ -57,6 +57,30 @@ test('does without Content-Range, which other sites may not see', async () => {
   });
 });
 
+test('asks for the rest of what is shorter than was asked for, before the file counts as cut off', async () => {
+  for (const saysRange of [true, false]) {
+    await withServer(BYTES, { saysRange, most: 30_000 }, async (server) => {
+      const source = await HttpSource.open(server.url, FAST);
+      await works(source);
+      assert.equal((await source.read(190_000, 300_000)).length, 10_000);
+      assert.equal(source.size, BYTES.length);
+      source.close();
+    });
+  }
+  // Other sites may refuse what lies behind the end in a way that a page cannot see.
+  for (const refusal of [() => Promise.reject(new TypeError('Failed to fetch')), async () => Response.error()]) {
+    await withServer(BYTES.subarray(0, 1000), { saysRange: false }, async (server) => {
+      const fetching = async (input: RequestInfo | URL, init?: RequestInit) => {
+        const response = await fetch(input, init);
+        return response.status === 416 ? refusal() : response;
+      };
+      const source = await HttpSource.open(server.url, { ...FAST, fetch: fetching as typeof fetch });
+      assert.deepEqual([source.size, server.requests], [1000, ['0-65535', '1000-65535']]);
+      source.close();
+    });
+  }
+});
+
 for (const [name, faults] of Object.entries({
   'has no ranges': { hasRanges: false },
   'has no ranges and says no length': { hasRanges: false, saysLength: false },

@@ -12,6 +12,8 @@ export interface Faults {
   etag: string | null;
   /** Whether Content-Range is sent, which other sites may not see. */
   saysRange: boolean;
+  /** Bytes of an answer at most. */
+  most: number;
   /** Whether it says how long an answer is. */
   saysLength: boolean;
   /** Statuses of the next answers. */
@@ -40,6 +42,7 @@ const NONE: Faults = {
   isCompressed: false,
   etag: '"first"',
   saysRange: true,
+  most: Number.POSITIVE_INFINITY,
   saysLength: true,
   statuses: [],
   cuts: [],
@@ -94,8 +97,10 @@ function answer(state: TestServer, request: IncomingMessage, response: ServerRes
     return;
   }
   const first = Number(asked[1]);
-  const last = Math.min(Number(asked[2]), size - 1);
-  if (first >= size) return void response.writeHead(416, { 'content-range': `bytes */${size}` }).end();
+  const last = Math.min(Number(asked[2]), size - 1, first + state.most - 1);
+  if (first >= size) {
+    return void response.writeHead(416, state.saysRange ? { 'content-range': `bytes */${size}` } : {}).end();
+  }
   if (state.saysRange) headers['content-range'] = `bytes ${first}-${last}/${size}`;
   if (state.saysLength) headers['content-length'] = String(last + 1 - first);
   response.writeHead(206, headers);

@@ -69,6 +69,8 @@ export class HttpSource implements Source {
   #beginning = new Uint8Array(0);
   #whole: Whole | null = null;
   #isRetrying = false;
+  /** Where an answer ended that was shorter than was asked for: the end of the file, unless there is more. */
+  #shortAt = -1;
   /** Requests that failed without an answer before there was any. */
   #refusals = 0;
 
@@ -142,13 +144,22 @@ export class HttpSource implements Source {
             if (isMore) break;
           }
           const isShort = reached < bytes.length && reached - before === lengthOf(response);
-          if (this.size === null && isShort) this.size = start + reached;
+          if (this.size === null && isShort) {
+            if (start + reached === this.#shortAt) this.size = this.#shortAt;
+            this.#shortAt = start + reached;
+          }
           if (this.size !== null) bytes = bytes.subarray(0, Math.max(0, this.size - start));
           if (reached === before && reached < bytes.length) throw new TemporaryFailure('the connection breaks off');
         }
       } catch (error) {
-        failures = reached > before ? 1 : failures + 1;
-        await this.#pause(error, failures, options.signal);
+        const isRefused = error instanceof TemporaryFailure || (error as KpcError).code === 'network';
+        if (isRefused && this.size === null && start + reached === this.#shortAt) {
+          this.size = this.#shortAt;
+          bytes = bytes.subarray(0, reached);
+        } else {
+          failures = reached > before ? 1 : failures + 1;
+          await this.#pause(error, failures, options.signal);
+        }
       } finally {
         if (!isWhole || this.#whole?.isDone) connection.end();
       }
@@ -172,6 +183,7 @@ export class HttpSource implements Source {
     const [first, , size] = rangeOf(response);
     if (response.status === 416) {
       if (this.size !== null && start < this.size) throw this.#replaced();
+      if (start === this.#shortAt) this.size ??= start;
       if (this.size !== null) return null; // it has become known since the request was sent
       if (this.#beginning.length > 0 && !(await this.#isSame(response, true))) throw this.#replaced();
       if (size === 0) throw emptyError(this.name);
