@@ -248,6 +248,24 @@ scenario('seeks in a long clip, where nothing has arrived', async () => {
   await close(page);
 });
 
+scenario('says why the picture is waited for, once that takes long', async () => {
+  const page = await open(TAG.replace('scene.kpc', 'slow/long.kpc'));
+  await shown(page);
+  await page.context().setOffline(true);
+  await player(page, (it) => {
+    it.play().catch(() => {});
+    it.currentTime = 0.9 * it.duration;
+  });
+  await until(page, (it) => it.shadowRoot.querySelector('.waiting').checkVisibility());
+  assert.equal(await inside(page, '.waiting').textContent(), '');
+  await until(page, (it) => /^The .*; trying again$/.test(it.shadowRoot.querySelector('.waiting').textContent));
+  await page.screenshot({ path: join(folder, 'waiting.png') });
+  await page.context().setOffline(false);
+  await until(page, (it) => !it.seeking);
+  assert.equal(await inside(page, '.waiting').isVisible(), false);
+  await close(page);
+});
+
 scenario('is turned by the mouse, and goes on for a moment', async () => {
   const page = await open(`${TAG}<div style="height: 2000px"></div>`);
   await shown(page);

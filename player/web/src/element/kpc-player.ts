@@ -457,6 +457,7 @@ export class KpcPlayer extends AudibleElement implements Model {
       isMovable: this.cameraControls,
       isShown,
       isWaiting: isStarting || (isShown && (clock.isSeeking || clock.isWaiting)),
+      reason: session?.clip?.message ?? null,
       isOffered: !this.#hasPlayed && clock.paused && (session === null ? this.src !== '' : duration > 0 && !isStarting),
       paused: clock.paused,
       ended: clock.ended,

@@ -8,6 +8,7 @@ import { fillSettings, fillViews, keyList, type Model } from './panels.js';
 import { SoundControls } from './sound_controls.js';
 import styles from './styles.css?text';
 import { clockText, Timeline } from './timeline.js';
+import { Waiting } from './waiting.js';
 
 /** Milliseconds for which messages are shown, and after which the bar of a playing clip hides. */
 const [NOTICE_MS, HINT_MS, IDLE_MS] = [4000, 5000, 2500];
@@ -22,6 +23,8 @@ export interface UiState {
   /** Whether the picture has taken the poster's place. */
   isShown: boolean;
   isWaiting: boolean;
+  /** Why the picture is waited for, as far as that is known. */
+  reason: string | null;
   paused: boolean;
   ended: boolean;
   time: number;
@@ -51,7 +54,7 @@ export class Ui {
   readonly player: HTMLElement;
   readonly stage: HTMLElement;
   readonly #poster = make('img', { class: 'poster', part: 'poster', alt: '', hidden: true });
-  readonly #spinner = make('div', { class: 'spinner', hidden: true });
+  readonly #waiting = new Waiting();
   readonly #large: IconButton;
   readonly #error = make('div', { class: 'error', role: 'alert', hidden: true });
   readonly #notice = make('div', { class: 'notice', role: 'status' });
@@ -117,7 +120,7 @@ export class Ui {
       this.#timeline.element,
       make('div', { class: 'buttons' }, this.#play.element, ...this.#sound.elements, this.#time, space, ...buttons),
     );
-    const cover = make('div', { class: 'cover' }, this.#spinner, this.#large.element, this.#error);
+    const cover = make('div', { class: 'cover' }, this.#waiting.element, this.#large.element, this.#error);
     const panels = [...this.#popups.map(({ panel }) => panel), this.#keys];
     this.player = make('div', { class: 'player', part: 'player' });
     this.#poster.addEventListener('error', () => {
@@ -165,7 +168,7 @@ export class Ui {
     this.#poster.classList.toggle('done', isShown);
     const isOffered = hasControls && state.isOffered && this.#error.hidden;
     this.#large.element.hidden = !isOffered;
-    this.#spinner.hidden = !isWaiting || isOffered || !this.#error.hidden;
+    this.#waiting.update(isWaiting && !(isOffered || !this.#error.hidden), state.reason);
     this.#play.element.hidden = state.duration === 0;
     this.#time.hidden = state.duration === 0;
     if (ended) this.#play.show('replay', 'Play again');
@@ -245,6 +248,7 @@ export class Ui {
   rest(): void {
     for (const timer of [this.#noticeTimer, this.#hintTimer, this.#idleTimer]) clearTimeout(timer);
     this.#notice.replaceChildren();
+    this.#waiting.update(false, null);
     this.player.classList.remove('idle');
   }
 
