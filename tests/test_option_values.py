@@ -91,5 +91,5 @@ def test_small_sizes_are_not_rounded_to_none(count: int, text: str) -> None:
 )
 def test_messages_name_what_is_wanted(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
-        importlib.import_module("kpc.encoder").main(["set", "-o", "x.kpc", *words])
+        importlib.import_module("kpc.encoder.cli.kpenc").main(["set", "-o", "x.kpc", *words])
     assert said in capsys.readouterr().err

@@ -15,6 +15,7 @@ import numpy as np
 from kpc.encoder.datasets.capture import opengl_pose
 from kpc.encoder.poses.instants import Picture
 from kpc.encoder.poses.orientation import looked_at, up_direction
+from kpc.format.common import extras
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.progress import Progress
 
@@ -234,7 +235,7 @@ def _run_worker(folder: Path) -> None:
     if process.returncode:
         said = (folder / "log").read_text(errors="replace")
         if "No module named 'pycolmap'" in said:
-            raise DatasetError('finding cameras needs COLMAP: pip install "kpc[poses]"')
+            raise DatasetError(f"finding cameras needs COLMAP: {extras.install('poses')}")
         last = said.strip().splitlines()[-1:] or ["no message"]
         raise DatasetError(f"COLMAP ended with code {process.returncode} ({last[0][:200]}); try again, or report it")
 

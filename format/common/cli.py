@@ -16,13 +16,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from kpc.format.common import interrupts
+from kpc.format.common import extras, interrupts
 from kpc.format.common.errors import KpcError, UsageError
 from kpc.format.common.text import escaped, notice, valid_unicode
 from kpc.format.common.version import VERSION
-
-# Packages that only some extras bring, with one that does.
-EXTRAS = {"numba": "cpu", "llvmlite": "cpu", "OpenEXR": "film", "distributed": "cluster", "fsspec": "cluster"}
 
 # Errors of writing where no space is left, or none that the user may take.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
@@ -40,8 +37,9 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         argv: its arguments; None for those of the process.
 
     Returns:
-        0 for success; 1 for a KpcError, or an error of the operating system that names a file or a full disk; 2 for a
-        usage error; 130 after Ctrl-C or SIGTERM. Any other exception is a bug and is raised with its traceback.
+        0 for success; 1 for a KpcError, a package of an extra that is missing, or an error of the operating system that
+        names a file or a full disk; 2 for a usage error; 130 after Ctrl-C or SIGTERM. Any other exception is a bug and
+        is raised with its traceback.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -56,10 +54,10 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
     except KpcError as error:
         failure = str(error), 1
     except ModuleNotFoundError as error:
-        if error.name not in EXTRAS:
+        remedy = extras.remedy(error.name, name)
+        if remedy is None:
             raise
-        remedy = f'in a checkout of KPC, pip install ".[{EXTRAS[error.name]}]"'
-        failure = f"needs {error.name}, which is not installed; {remedy}", 1
+        failure = remedy, 1
     except (KeyboardInterrupt, SystemError) as error:
         # A Ctrl-C that arrives inside a compiled function surfaces as a SystemError.
         if not any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):

@@ -21,6 +21,7 @@ from typing import IO
 import ffmpeg
 import numpy as np
 
+from kpc.format.common import extras
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import MediaError, UsageError
 from kpc.format.common.text import valid_unicode
@@ -296,7 +297,8 @@ def ffmpeg_binary() -> str:
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     except (ModuleNotFoundError, RuntimeError) as error:
         raise MediaError(
-            'ffmpeg: films need it, and PATH has none; install it (Debian: apt install ffmpeg) or pip install ".[film]"'
+            "ffmpeg: films need it, and PATH has none; install it (Debian: apt install ffmpeg) or "
+            f"{extras.install('film')}"
         ) from error
 
 

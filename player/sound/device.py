@@ -11,11 +11,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from kpc.format.common import extras
 from kpc.format.common.errors import MediaError
 from kpc.format.scene.sound import SAMPLE_RATE
 
 BUFFER_MS = 60  # of the device: what is pulled is heard so much later, about
-MISSING = 'the clip has sound; pip install ".[sound]" plays it'
+MISSING = f"the clip has sound; {extras.install('sound')} plays it"
 NO_DEVICE = "there is no sound device; the clip plays without sound"
 
 Pull = Callable[[int], np.ndarray]  # returns so many frames, (n, 2) float32

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from kpc.format.common import extras
 from kpc.format.common.errors import MediaError
 from kpc.format.scene.sound import SAMPLE_RATE, Sound, packet_samples
 
@@ -19,7 +20,7 @@ FIRST, LAST = 2, 4  # flags of its first and its last page
 # Packets on a page; a packet takes a segment for each 255 bytes, and a page has at most 255. Larger packets are larger
 # than Opus has a use for, and become silence.
 PAGE_PACKETS, MOST_BYTES = 50, 254 * 255
-MISSING = 'no decoder of sound is installed; pip install ".[sound]" brings it'
+MISSING = f"no decoder of sound is installed; {extras.install('sound')} brings it"
 
 
 def decode(sound: Sound) -> np.ndarray:

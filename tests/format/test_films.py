@@ -198,6 +198,6 @@ def test_no_ffmpeg_anywhere(monkeypatch: pytest.MonkeyPatch, is_there: bool) -> 
 
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", SimpleNamespace(get_ffmpeg_exe=none) if is_there else None)
     monkeypatch.setattr(films.shutil, "which", lambda name: None)
-    with pytest.raises(MediaError, match=r'apt install ffmpeg\) or pip install "\.\[film\]"') as refused:
+    with pytest.raises(MediaError, match=r'apt install ffmpeg\) or pip install "kpc\[film\]"') as refused:
         ffmpeg_binary.__wrapped__()
     assert "\n" not in str(refused.value)

@@ -20,7 +20,7 @@ from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container import groups, scene_io
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Scene
-from kpc.tools.bench import harness, kpbench, plot, quality, tables
+from kpc.tools.bench import figures, harness, kpbench, quality, tables
 from scenes import tiny_scene, with_appearances
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -124,7 +124,7 @@ def test_photographs_are_measured_on_their_right_halves_at_any_time(tmp_path: Pa
     for name in ("moving_psnr", "still_flip", "flicker", "moving_share"):
         assert found["means"][name] is None, name
     record: dict[str, Any] = {"kind": "quality", "name": "photos", "frames": found["frames"]}
-    axes = plot.fidelity([record]).axes[0]
+    axes = figures.fidelity([record]).axes[0]
     assert len(axes.lines) == 1 and len(axes.lines[0].get_xdata()) == reported.pictures
 
 

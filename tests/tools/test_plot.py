@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from kpc.format.common.errors import FormatError
-from kpc.tools.bench import plot
+from kpc.tools.bench import figures, plot
 from kpc.tools.bench.records import Record
 
 MACHINE = {"cpu": "Test CPU", "cores": 2, "memory_bytes": 8 << 30, "os": "Linux", "python": "3.11"}
@@ -30,7 +30,7 @@ def record(name: str, seconds: float, psnrs: list[float | None], **changes: obje
 
 def test_a_line_per_dataset_through_medians_and_a_dot_per_repeat() -> None:
     records = [record("a", 600, [30.0]), record("b", 60, [22.5]), record("a", 60, [20.0, 28.0, 21.0])]
-    figure = plot.curves(records)
+    figure = figures.curves(records)
     assert [axes.get_title() for axes in figure.axes] == ["held-out PSNR, dB", "held-out SSIM", "file, KB"]
     psnr, _, size = figure.axes
     line, dots, other, _ = psnr.lines
@@ -48,9 +48,9 @@ def test_a_line_per_dataset_through_medians_and_a_dot_per_repeat() -> None:
 
 
 def test_values_that_were_not_measured_are_left_out() -> None:
-    figure = plot.curves([record("a", 60, [None]), record("a", 120, [None])])
+    figure = figures.curves([record("a", 60, [None]), record("a", 120, [None])])
     assert [axes.get_title() for axes in figure.axes] == ["file, KB"]
-    figure = plot.curves([record("a", 60, [None]), record("a", 120, [21.0])])
+    figure = figures.curves([record("a", 60, [None]), record("a", 120, [21.0])])
     assert [len(axes.lines[0].get_xydata()) for axes in figure.axes] == [1, 1, 2]
 
 
@@ -86,4 +86,4 @@ def test_other_records_are_refused_in_one_line(tmp_path: Path, capsys: pytest.Ca
         assert output.out == "" and output.err.startswith("plot: ") and output.err.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["x.json"]
     with pytest.raises(FormatError):
-        plot.curves([record("a", 60, [20.0], kind="encode")])
+        figures.curves([record("a", 60, [20.0], kind="encode")])

@@ -142,7 +142,7 @@ def test_films_at_another_speed_have_none_and_say_so(run: Run, folder, tmp_path,
 
     monkeypatch.setattr(film_sound, "decode", refuse)
     code, out, err = run(folder / "a.kpc", "--from", 1, *size)
-    assert code == 0 and "with sound" not in out and 'pip install ".[sound]"' in err
+    assert code == 0 and "with sound" not in out and 'pip install "kpc[sound]"' in err
 
 
 def test_packets_decode_as_by_libopus_however_long_they_are():

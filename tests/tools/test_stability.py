@@ -15,8 +15,8 @@ from kpc.encoder.field.render import Rays, render_reference
 from kpc.format.common.errors import DisplayError
 from kpc.player.gl.programs import is_software
 from kpc.player.gl.renderer import MOST_SAMPLES, Renderer
-from kpc.tools.bench import kpbench, plot, results, tables
-from kpc.tools.bench.stability import pictures, stages, sweeps
+from kpc.tools.bench import kpbench, results, tables
+from kpc.tools.bench.stability import figure, pictures, stages, sweeps
 from kpc.tools.bench.stability.sweeps import Sweep
 from scenes import tiny_scene
 
@@ -52,7 +52,7 @@ def test_the_command_writes_a_record_and_a_panel_for_each_sweep(
     printed = capsys.readouterr().err
     assert "a stage  amount of something  up to 1" in printed
     assert "| a stage | amount of something | up to 1 | picture | 2.0e-03 | numpy | 2 |" in tables.markdown([kept])
-    titles = [axes.get_title() for axes in plot.stability([kept, wrong]).axes]
+    titles = [axes.get_title() for axes in figure.draw([kept, wrong]).axes]
     assert titles[:2] == ["a stage", "another"] and (tmp_path / "stability.svg").exists()
 
 

@@ -12,8 +12,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import fsspec
-
 from kpc.format.common.errors import UsageError
 from kpc.format.common.media_files import is_hidden
 from kpc.tools.batch.store import reason
@@ -78,6 +76,8 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _remote_address(source: str) -> str:
+    import fsspec
+
     fs, root = fsspec.core.url_to_fs(source)
     names = sorted(fs.find(root)) or [root]
     return address_of([(name.removeprefix(root), str(fs.ukey(name))) for name in names])

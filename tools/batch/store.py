@@ -14,8 +14,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import fsspec
-
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError
 
@@ -41,6 +39,8 @@ class Store:
         Raises:
             StoreError: the address is of an unknown kind, or the folder cannot be made.
         """
+        import fsspec  # here, since kpbatch has a help without it
+
         self.address = address
         try:
             self._fs, self._root = fsspec.core.url_to_fs(address)

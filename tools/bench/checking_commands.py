@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from kpc.format.common import cli
+from kpc.format.common import cli, extras
 from kpc.format.common.progress import progress
 from kpc.format.container.groups import Groups
 from kpc.tools.bench import harness
@@ -71,18 +71,18 @@ def _quality(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
     from kpc.tools.bench import quality  # needs torch
 
     if options.out is not None:
-        from kpc.tools.bench import plot  # needs matplotlib
+        from kpc.tools.bench import figures  # needs matplotlib
     record, job = _beginning("quality", options, origin)
     found = harness.isolated(quality.measure, job)
     record |= {"frames": found["frames"], "repeats": [found["means"]]}
     print(quality.frame_table(found["frames"]), file=sys.stderr)
     if found["means"]["flip"] is None:
-        print('kpbench: FLIP needs flip-evaluator; pip install "kpc[bench]"', file=sys.stderr)
+        print(f"kpbench: FLIP needs flip-evaluator; {extras.install('bench')}", file=sys.stderr)
     yield record
     if options.out is not None:
         with cli.atomic_write(options.out.with_suffix(".csv")) as aside:
             aside.write_text(quality.as_csv([record]))
-        plot.save(plot.fidelity([record]), options.out.with_suffix(".svg"))
+        figures.save(figures.fidelity([record]), options.out.with_suffix(".svg"))
 
 
 def _pictures(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
@@ -129,7 +129,8 @@ def _stability(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
     from kpc.tools.bench.stability import pictures, scenes, stages, sweeps  # need torch
 
     if options.out is not None:
-        from kpc.tools.bench import plot  # needs matplotlib
+        from kpc.tools.bench import figures  # needs matplotlib
+        from kpc.tools.bench.stability import figure
     drawn_by = scenes.opengl_name()
     if drawn_by is None:
         print("kpbench: no OpenGL here; the player's renderers are left out", file=sys.stderr)
@@ -144,4 +145,4 @@ def _stability(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
         records.append(record)
         yield record
     if options.out is not None:
-        plot.save(plot.stability(records), options.out.with_suffix(".svg"))
+        figures.save(figure.draw(records), options.out.with_suffix(".svg"))

@@ -76,7 +76,7 @@ def _codec(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
             f"--dataset is given {len(folders)} times for {len(options.scenes)} scenes; name one for each, or none"
         )
     if options.out is not None:
-        from kpc.tools.bench import plot  # needs matplotlib
+        from kpc.tools.bench import figures  # needs matplotlib
     records: list[Record] = []
     logs: list[Path] = []
     for source, folder in zip(options.scenes, folders, strict=True):
@@ -98,7 +98,7 @@ def _codec(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
     if options.out is not None:
         with cli.atomic_write(options.out.with_suffix(".csv")) as aside:
             aside.write_text(codec_bench.as_csv(records))
-        plot.save(plot.rate_distortion(records), options.out.with_suffix(".svg"))
+        figures.save(figures.rate_distortion(records), options.out.with_suffix(".svg"))
     for path in logs:
         path.unlink()
 

@@ -241,9 +241,9 @@ def _groups(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
             records.append(record | harness.isolated(_measure_joins, job))
             yield records[-1]
     if options.out is not None:
-        from kpc.tools.bench import plot  # needs matplotlib
+        from kpc.tools.bench import figures  # needs matplotlib
 
-        plot.save(plot.per_frame(records), options.out.with_suffix(".svg"))
+        figures.save(figures.per_frame(records), options.out.with_suffix(".svg"))
 
 
 def _ceiling(options: argparse.Namespace, origin: Record) -> Iterator[Record]:

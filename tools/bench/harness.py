@@ -65,16 +65,9 @@ def existing_folder(source: Path) -> Path:
 
 
 def encoder() -> ModuleType:
-    """Return the module `kpenc`.
+    """Return the module `kpenc`, which needs the extra `encoder`."""
+    from kpc.encoder.cli import kpenc
 
-    Raises:
-        UsageError: a package that encoding needs is not installed.
-    """
-    try:
-        from kpc.encoder.cli import kpenc  # needs torch
-    except ModuleNotFoundError as error:
-        remedy = 'in a checkout of KPC, pip install ".[encoder]"'
-        raise UsageError(f"encode needs {error.name}, which is not installed; {remedy}") from error
     return kpenc
 
 

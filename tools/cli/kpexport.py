@@ -16,6 +16,7 @@ import contextlib
 import sys
 import time as clock
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -75,7 +76,7 @@ def _command(argv: list[str]) -> None:
 def _export_geometry(task: Task, options: argparse.Namespace) -> None:
     """Write the points or the mesh of each frame."""
     if options.mesh:
-        _needed("skimage", "scikit-image")
+        import_module("skimage")  # is missed before the scene is read, where it is not installed
     loaded = kpc.load(options.input)
     scene, _ = loaded.at(0.0)
     shots = _shots(scene, loaded, options)
@@ -216,19 +217,10 @@ def _write_cameras(task: Task, output: Path, tracks: list[Track], fps: float) ->
 
 
 def _usd() -> ModuleType:
-    """Return the module for USD, which needs usd-core."""
-    _needed("pxr", "usd-core")
+    """Return the module for USD, which needs the extra `exchange`."""
     from kpc.tools.exchange import usd_cameras
 
     return usd_cameras
-
-
-def _needed(module: str, package: str) -> None:
-    """Refuse to go on without a package of the extra."""
-    try:
-        __import__(module)
-    except ImportError as error:
-        raise KpcError(f'{package} is not installed; pip install -c constraints.txt ".[exchange]"') from error
 
 
 def _say(text: str) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from kpc.encoder.evaluation.ablations import BASELINE
 from kpc.tools.bench.encoding_commands import DEFAULT_PRESET
-from kpc.tools.bench.plot import DEEPEST_DB
+from kpc.tools.bench.figures import DEEPEST_DB
 from kpc.tools.bench.records import Record, median
 from kpc.tools.bench.report.charts import Bar, Bars, Chart, Point, Series
 from kpc.tools.bench.report.exponents import exponent
