@@ -18,7 +18,7 @@ visible.
 
 import itertools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -38,7 +38,7 @@ from kpc.format.container.sources import AnySource, RemoteSource, Source, open_s
 from kpc.format.container.timeline import Span, Timeline, check_spans
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.metadata import Metadata, merged
-from kpc.format.scene.scene import Clip, Scene
+from kpc.format.scene.scene import Appearance, Clip, Scene
 
 
 class Groups:
@@ -282,6 +282,15 @@ class GroupedScene:
         parts = self.timeline.blend_at(time)
         wanted = {number for number, *_ in parts}
         return [(self._scene(number, wanted), local_time, weight) for number, local_time, weight in parts]
+
+    def appearances_at(self, times: Iterable[float]) -> list[tuple[Appearance, ...]]:
+        """Return the appearances of each group that is shown at one of some times, without decoding it.
+
+        Raises:
+            FormatError, BudgetError, NetworkError: as `read`.
+        """
+        numbers = {number for time in times for number, *_ in self.timeline.blend_at(time)}
+        return [self.groups.open(number).appearances() for number in sorted(numbers)]
 
     def _scene(self, number: int, wanted: set[int]) -> Scene:
         # Release what is no longer needed before another group is read.

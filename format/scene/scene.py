@@ -21,7 +21,7 @@ corner-aligned: u in [0, 1] is read at u * (size - 1). Density is per longest ed
 
 import itertools
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -167,6 +167,12 @@ class Appearance:
 
     name: str
     code: np.ndarray
+
+
+def common_names(groups: Iterable[Sequence[Appearance]]) -> list[str]:
+    """Return the names that are in all groups of a clip that have appearances, in the order of the first of them."""
+    known = [[one.name for one in group] for group in groups if group]
+    return [name for name in known[0] if all(name in names for names in known)] if known else []
 
 
 @dataclass(frozen=True)

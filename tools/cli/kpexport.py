@@ -88,7 +88,7 @@ def _export_geometry(task: Task, options: argparse.Namespace) -> None:
     _say_where(placement, scene.metadata)
     if is_clipped(scene):
         _say("the scene goes on beyond its box; only what lies in the box is exported")
-    render = None if options.mesh else _renderer(loaded, options)
+    render = None if options.mesh else _renderer(loaded, shots, options)
     output = Path(options.output)
     started, count = clock.monotonic(), 0
     with contextlib.ExitStack() as alone:
@@ -126,11 +126,11 @@ def _shots(scene: Scene, loaded: Scene | GroupedScene, options: argparse.Namespa
     return shots_of(scene, loaded.clip, argparse.Namespace(**times, **fixed), is_film=False)
 
 
-def _renderer(loaded: Scene | GroupedScene, options: argparse.Namespace) -> Render:
+def _renderer(loaded: Scene | GroupedScene, shots: Shots, options: argparse.Namespace) -> Render:
     """Return a function that renders the scene over black."""
     black = {"content": None, "part": Part.FULL, "background": np.zeros(3, np.float32)}
     chosen = {name: getattr(options, name) for name in ("backend", "quality", "appearance")}
-    render, name = renderer_of(loaded, argparse.Namespace(**black, **chosen))
+    render, name = renderer_of(loaded, argparse.Namespace(**black, **chosen), shots.times())
     _say(name)
     return render
 

@@ -25,7 +25,7 @@ from kpc.format.container.shared_planes import SharedPlanes
 from kpc.format.container.slices import sliced
 from kpc.format.container.sources import open_source
 from kpc.format.scene.motion import QuantisedMotion
-from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, Clip, HybridDecoder
+from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, Appearance, Clip, HybridDecoder, common_names
 from kpc.format.scene.sound import SAMPLE_RATE
 from kpc.format.scene.space import FAR, Contraction, SpaceMapping
 from kpc.format.scene.static import constant_fraction, static_fraction
@@ -63,6 +63,7 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
         "expected_bytes": None,
         "clip": None,
         "cameras": None,
+        "appearances": None,
         "metadata": None,
         "groups": [],
         "shared_planes": [],
@@ -114,8 +115,9 @@ def _describe_file(groups: Groups, only: int | None, info: dict[str, Any]) -> No
     def noted(number: int) -> dict[str, Any]:
         return info if only in (None, number) else dict(info)
 
-    info["clip"], users = _clip(groups.clip), Counter[int]()
-    info["groups"] = [_group(groups, span, noted(span.group), users) for span in sound_spans(groups.timeline)]
+    info["clip"], users, looks = _clip(groups.clip), Counter[int](), list[tuple[Appearance, ...]]()
+    info["groups"] = [_group(groups, span, noted(span.group), users, looks) for span in sound_spans(groups.timeline)]
+    info["appearances"] = common_names(looks)
     info["shared_planes"] = [_shared_plane(groups.reader, number, users[number]) for number in groups.reader.beside]
     info["clip"]["is_dynamic"] = any(one["is_dynamic"] for one in info["groups"])
     with _noting(noted(0)):
@@ -147,13 +149,16 @@ def _clip(clip: Clip) -> dict[str, Any]:
     return {"frame_count": clip.frame_count, "fps": clip.fps, "duration_s": clip.total_s}
 
 
-def _group(groups: Groups, heard: SoundSpan, info: dict[str, Any], users: Counter[int]) -> dict[str, Any]:
+def _group(
+    groups: Groups, heard: SoundSpan, info: dict[str, Any], users: Counter[int], looks: list[tuple[Appearance, ...]]
+) -> dict[str, Any]:
     """Return what header, index and SCNE of a group say, as far as they can be read; the first error goes to `info`.
 
     The group of a file without groups is the whole file.
 
     Args:
         users: how many groups use each shared plane; this one is counted.
+        looks: the appearances of each group; those of this one are appended.
     """
     number, clip = heard.group, groups.clip
     span = groups.timeline.spans[number]
@@ -167,6 +172,7 @@ def _group(groups: Groups, heard: SoundSpan, info: dict[str, Any], users: Counte
             head = reader.head
             users.update(plane.chunk for plane in reader.beside.values())
             sound = _sound(reader, heard)
+            looks.append(reader.appearances())
     is_complete = head is not None and (not groups.is_single or groups.reader.source.size >= groups.size_bytes[0])
     return {
         "number": number,

@@ -26,6 +26,7 @@ def page(info: Mapping[str, Any]) -> str:
     if described is None:
         lines += _item("clip", _clip(info)) + _sound(info["groups"])
         lines += _item("cameras", "not known" if info["cameras"] is None else str(info["cameras"]))
+        lines += _appearances_line(info["appearances"])
         return "\n".join([*lines, *_groups(info), *_shared_planes(info["shared_planes"])])
     if len(info["groups"]) > 1:
         since, until = described["shown_s"]

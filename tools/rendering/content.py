@@ -1,8 +1,7 @@
 """What pictures show: the scene by one of two renderers, its background, what moves, and the mean of many samples."""
 
 import argparse
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +15,7 @@ from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
 from kpc.player.cpu.reference import Rendering
 from kpc.player.quality import LEVELS
+from kpc.tools.rendering.appearances import Chosen, appearance_in
 from kpc.tools.rendering.bands import in_bands
 from kpc.tools.rendering.clean_plate import CleanPlates, matte, motion_colours
 
@@ -29,15 +29,19 @@ BLACK_BEHIND = ("moving", "matte")
 Draw = Callable[[Scene, Camera, float, Sequence[Scene]], Rendering]
 
 
-def renderer_of(loaded: Scene | GroupedScene, options: argparse.Namespace) -> tuple[Render, str]:
+def renderer_of(
+    loaded: Scene | GroupedScene, options: argparse.Namespace, times: Iterable[float]
+) -> tuple[Render, str]:
     """Return a function that renders a picture over the background of the options, and the name of the renderer.
 
-    With a transparent background colours are multiplied by opacity.
+    With a transparent background colours are multiplied by opacity. The appearance of the options is looked for in all
+    that is shown at these times before anything is rendered.
     """
     if options.backend == "reference" and options.quality != "reference":
         raise UsageError(f"--quality {options.quality}: is of the gl backend; leave it out, or --backend reference")
-    appearance_of(loaded.at(0.0)[0], options.appearance)  # reports an unknown name at once
-    draw, name = _reference_drawing(options) if options.backend == "reference" else _gl_drawing(options)
+    chosen = appearance_in(loaded, options.appearance, times)
+    make_drawing = _reference_drawing if options.backend == "reference" else _gl_drawing
+    draw, name = make_drawing(options, chosen)
     needed: list[Scene] = []
     plates = CleanPlates(lambda scene, camera, time: draw(scene, camera, time, needed))
 
@@ -76,7 +80,7 @@ def _what_moves(scene: Scene, picture: Rendering, share: np.ndarray, content: st
     return replace(picture, rgb=share[..., None] * covering, opacity=share * picture.opacity)
 
 
-def _gl_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
+def _gl_drawing(options: argparse.Namespace, chosen: Chosen) -> tuple[Draw, str]:
     from kpc.player.gl import offscreen  # here, since the reference backend works without moderngl
     from kpc.player.gl.programs import is_software
     from kpc.player.gl.renderer import Renderer
@@ -92,7 +96,7 @@ def _gl_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
         renderer = next((one for one in renderers if one.scene is scene), None)
         if renderer is None:
             renderers.append(renderer := Renderer(ctx, scene, LEVELS[options.quality]))
-        appearance = appearance_of(scene, options.appearance)
+        appearance = chosen(scene)
 
         def drawn(camera: Camera) -> Rendering:
             return renderer.render(camera, time, part=options.part, appearance=appearance)
@@ -102,9 +106,9 @@ def _gl_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
     return draw, offscreen.describe(ctx)
 
 
-def _reference_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
+def _reference_drawing(options: argparse.Namespace, chosen: Chosen) -> tuple[Draw, str]:
     def draw(scene: Scene, camera: Camera, time: float, needed: Sequence[Scene]) -> Rendering:
-        appearance = appearance_of(scene, options.appearance)
+        appearance = chosen(scene)
 
         def drawn(camera: Camera) -> Rendering:
             return reference.render(scene, camera, time, part=options.part, appearance=appearance)
@@ -162,29 +166,3 @@ def linear_colours(picture: Rendering, is_transparent: bool) -> np.ndarray:
     rgb = np.clip(straight_colours(picture) if is_transparent else picture.rgb, 0, 1).astype(np.float64)
     linear = linear_from_srgb(rgb)
     return linear * picture.opacity[..., None] if is_transparent else linear
-
-
-def appearance_of(scene: Scene, text: str | None) -> np.ndarray | None:
-    """Return the embedding that --appearance asks for; None, the average, without the option.
-
-    The text is NAME, or ONE:OTHER:SHARE for a linear interpolation; names themselves may contain colons.
-
-    Raises:
-        UsageError: the scene has no appearance of that name, or the share lies outside [0, 1].
-    """
-    if text is None:
-        return None
-    names = {appearance.name for appearance in scene.appearances}
-    names |= {os.path.splitext(name)[0] for name in names}  # which `Scene.appearance` takes, too
-    pair, _, share = text.rpartition(":")
-    if text in names or ":" not in pair:
-        return scene.appearance(text)
-    try:
-        weight = float(share)
-    except ValueError:
-        weight = -1.0
-    if not 0.0 <= weight <= 1.0:
-        raise UsageError(f"--appearance {text}: {share!r} is not a share in [0, 1]; give NAME or NAME:NAME:SHARE")
-    colons = [k for k, letter in enumerate(pair) if letter == ":"]
-    split = next((k for k in colons if names.issuperset({pair[:k], pair[k + 1 :]})), colons[0])
-    return scene.interpolate_appearance(pair[:split], pair[split + 1 :], weight)

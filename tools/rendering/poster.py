@@ -30,11 +30,11 @@ def render_poster(loaded: Scene | GroupedScene) -> np.ndarray:
         appearance=None, backend="gl", quality="reference", content=None, background=None, part=Part.FULL
     )
     try:
-        render, _ = renderer_of(loaded, options)
+        render, _ = renderer_of(loaded, options, [time])
         side = SIDE
     except DisplayError:
         options.backend = "reference"
-        render, _ = renderer_of(loaded, options)
+        render, _ = renderer_of(loaded, options, [time])
         side = SLOW_SIDE
     picture = render(fit_camera(camera, side, round(side / OPENING_ASPECT)), time)
     return np.round(np.clip(picture.rgb, 0, 1) * 255).astype(np.uint8)

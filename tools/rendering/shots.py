@@ -6,7 +6,7 @@ Time is continuous: frame n of a film is at n / fps seconds, whatever the rate o
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -89,6 +89,10 @@ class Shots:
             return [self.timeline.at(number)]
         steps = (np.arange(SHUTTER_INSTANTS) + 0.5) / SHUTTER_INSTANTS - 0.5
         return [self.timeline.at(number + self.shutter * float(step)) for step in steps]
+
+    def times(self) -> Iterator[float]:
+        """Yield the clip's times of all instants of all frames."""
+        return (time for number in self.numbers for _, time in self.instants(number))
 
 
 def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bool) -> Shots:
