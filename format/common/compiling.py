@@ -21,13 +21,14 @@ LOCK = "numba:compiler_lock"
 
 
 class CompilationMonitor:
-    """Measures how long numba compiles, and prints NOTICE once on a terminal. Compilations may nest."""
+    """Measures how long numba compiles, and prints a notice once on a terminal. Compilations may nest."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._depth = 0
         self._begun = self._spent = 0.0
         self._notified = False
+        self.notice = NOTICE
         self.announces = False  # whether to print NOTICE where stderr is no terminal, too
 
     def on_start(self, _: Any) -> None:
@@ -40,7 +41,7 @@ class CompilationMonitor:
             notify = self.is_compiling and not self._notified and shows
             self._notified |= notify
         if notify:
-            print(NOTICE, file=sys.stderr)
+            print(self.notice, file=sys.stderr)
 
     def on_end(self, _: Any) -> None:
         """Record that numba is done with a function."""

@@ -37,6 +37,7 @@ from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, QuantiseFunction, Trad
 from kpc.encoder.rdo.sequential_finetune import code_sequentially
 from kpc.format.coding.quantise import quantise_scene, round_decoder
 from kpc.format.common.errors import KpcError, TrainingError
+from kpc.format.common.progress import progress
 from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 from kpc.tools.bench import baselines
@@ -158,7 +159,8 @@ def measure(
             jobs += [Job(scene, name, setting) for setting in reversed(baseline.settings)]
     points = {} if log is None else log.begin()
     remaining = [job for job in jobs if job.key not in points]
-    for job, found_point in zip(remaining, in_parallel(remaining, views, processes), strict=True):
+    measured = progress(in_parallel(remaining, views, processes), "codec", len(remaining), "points")
+    for job, found_point in zip(remaining, measured, strict=True):
         points[job.key] = found_point
         if log is not None:
             log.add(job.key, found_point)

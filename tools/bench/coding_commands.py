@@ -8,6 +8,7 @@ from typing import Any
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
+from kpc.format.common.progress import progress
 from kpc.tools.bench import decode_bench, harness
 from kpc.tools.bench.provenance import machine
 from kpc.tools.bench.records import Record
@@ -117,5 +118,8 @@ def _decode(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
     """Yield a record for each scene."""
     for source in options.scenes:
         record = harness.new_record("decode", source, origin, {})
-        repeats = [harness.isolated(decode_bench.measure, source) for _ in range(options.repeats)]
+        repeats = [
+            harness.isolated(decode_bench.measure, source)
+            for _ in progress(range(options.repeats), "decode", unit="repeats")
+        ]
         yield record | {"seed": None, "renderer": "cpu", "repeats": repeats}

@@ -20,6 +20,8 @@ from kpc.encoder.coding import predictive, rans, texel_map, transform
 from kpc.encoder.coding.scene_writer import scene_chunks
 from kpc.encoder.coding.segments import encode_segment
 from kpc.format.coding.quantise import needed_texels
+from kpc.format.common.compiling import MONITOR
+from kpc.format.common.progress import in_parts, progress
 from kpc.format.container.container import Chunk, Codec, pack
 from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.container.segments import SegmentSideInfo, side_info_at
@@ -30,6 +32,9 @@ DECODINGS = 5
 
 # Bits of a stored probability, in the variant with static tables.
 TABLE_BITS = 12
+
+# Printed while numba compiles: a changed coder is in no cache.
+NOTICE = "compiling changed coders, which every run does anew"
 
 # Recorded decisions of adaptive models lie below this in a trace, and those of the texel map from this index on.
 RECORDED, MAP_INDEX = -10000, 4096
@@ -63,6 +68,7 @@ def measure(scene: Path) -> dict[str, dict[str, float]]:
         By variant: `plane_bytes` of all planes; for complete codecs also `decode_ms` of the planes on one core; for the
         baseline also `file_bytes`, and `read_ms` of `kpc.format.container.scene_io.read`.
     """
+    MONITOR.notice = NOTICE
     quantised = read(scene)
     chunks = scene_chunks(quantised)
     segments = []
@@ -82,10 +88,10 @@ def measure(scene: Path) -> dict[str, dict[str, float]]:
         "baseline": _decoding(pack(chunks, values)) | {"file_bytes": scene.stat().st_size, "read_ms": read_ms},
         "zstd": _decoding(pack(_without_entropy_coder(chunks), values)),
     }
-    for name, variant in VARIANTS.items():
+    for name, variant in progress(list(VARIANTS.items()), "entropy", unit="variants"):
         if any(map(variant.affects, segments)):
             size = variant.compiled()
-            sizes = [size(one) if variant.affects(one) else len(one.body) for one in segments]
+            sizes = [size(one) if variant.affects(one) else len(one.body) for one in in_parts(segments)]
             found[name] = {"plane_bytes": sum(sizes)}
     return found
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from kpc.format.common.fidelity import psnr
+from kpc.format.common.progress import Progress, progress
 from kpc.player.app.desktop import glfw
 from kpc.player.app.preferences import Preferences
 from kpc.player.gl import offscreen
@@ -45,20 +46,22 @@ def measure(job: Pacing) -> dict[str, Any]:
         seconds: list[float] = []
         rasters: list[tuple[int, int]] = []
         kept: list[tuple[Any, float, np.ndarray]] = []
-        while now - began < LEAD_IN_S + job.seconds or not kept:
-            before, now = now, clock.perf_counter()
-            glfw.poll_events()
-            if job.turn:
-                player.state.look_from(player.state.view.orbit(math.radians(job.turn) * (now - before), 0.0))
-            player.frame()
-            if now - began < LEAD_IN_S:
-                continue
-            seconds.append(clock.perf_counter() - now)
-            rasters.append(player.scene_view.raster)
-            if now - began - LEAD_IN_S >= job.seconds * len(kept) / COMPARED:
-                kept.append((player.state.view, player.state.playback.time, player.scene_view.pixels()))
+        with Progress("playing", LEAD_IN_S + job.seconds, "s") as bar:
+            while now - began < LEAD_IN_S + job.seconds or not kept:
+                bar.reach(now - began)  # between two frames, in the time of neither
+                before, now = now, clock.perf_counter()
+                glfw.poll_events()
+                if job.turn:
+                    player.state.look_from(player.state.view.orbit(math.radians(job.turn) * (now - before), 0.0))
+                player.frame()
+                if now - began < LEAD_IN_S:
+                    continue
+                seconds.append(clock.perf_counter() - now)
+                rasters.append(player.scene_view.raster)
+                if now - began - LEAD_IN_S >= job.seconds * len(kept) / COMPARED:
+                    kept.append((player.state.view, player.state.playback.time, player.scene_view.pixels()))
         psnrs = []
-        for player.state.view, player.state.playback.time, shown in kept:
+        for player.state.view, player.state.playback.time, shown in progress(kept, "comparing", unit="pictures"):
             player.scene_view.draw("reference", still=True)
             psnrs.append(psnr(shown / 255, player.scene_view.pixels() / 255))
         middle = statistics.median_high(rasters)

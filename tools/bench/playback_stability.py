@@ -13,6 +13,7 @@ import moderngl
 import numpy as np
 
 from kpc.format.common.memory import peak_memory_bytes
+from kpc.format.common.progress import progress
 from kpc.format.container.sources import open_source
 from kpc.player.app.desktop import glfw
 from kpc.player.app.player import Player
@@ -81,7 +82,7 @@ def measure(job: LongPlay) -> dict[str, Any]:
         every = max(job.frames // MEMORY_SAMPLES, 1)
         numbers, memory, warm = [], [], int(WARM_UP_SHARE * job.frames)
         started = clock.perf_counter()
-        for number in range(job.frames):
+        for number in progress(range(job.frames), "playing", unit="frames"):
             if number == warm:
                 created.clear()
             glfw.poll_events()

@@ -11,6 +11,7 @@ import numpy as np
 
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.memory import peak_memory_bytes
+from kpc.format.common.progress import in_parts, progress
 from kpc.format.container import scene_io
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rig import Rig
@@ -82,16 +83,16 @@ def play_once(job: Play) -> dict[str, Record]:
     """
     stage = _open(job)
     shaders = ("fragment", "compute") if tries_compute(stage.ctx) else ("fragment",)
+    variants = [(level, shader) for level in LEVELS for shader in shaders]
     renderers: dict[Variant, Renderer] = {}
     first: dict[Variant, Record] = {}
-    for level, quality in LEVELS.items():
-        for shader in shaders:
-            renderers[level, shader], first[level, shader] = _first_frame(stage, quality, shader)
+    for level, shader in progress(variants, "first frames", unit="variants"):
+        renderers[level, shader], first[level, shader] = _first_frame(stage, LEVELS[level], shader)
     took: dict[Variant, list[tuple[float, float]]] = {key: [] for key in renderers}
     times = frame_times(stage.scene, WARM_UP + job.frames, 1.0)
-    for start in range(0, len(times), TURN_FRAMES):
-        for key, renderer in renderers.items():
-            took[key] += [stage.draw(renderer, float(time)) for time in times[start : start + TURN_FRAMES]]
+    for start in progress(range(0, len(times), TURN_FRAMES), "timing", unit="turns"):
+        for key in in_parts(variants):
+            took[key] += [stage.draw(renderers[key], float(time)) for time in times[start : start + TURN_FRAMES]]
     median = {key: float(np.median(each[WARM_UP:], axis=0)[0]) for key, each in took.items()}
     reference_ms = min(median["reference", shader] for shader in shaders)
     found = {}
@@ -178,7 +179,8 @@ def compare(job: Play) -> tuple[str, dict[str, Record]]:
     fixed = [fit_camera(Rig.of(scene).cameras[0], *size)] * LEAD_IN_FRAMES
     moving = [fit_camera(camera, *size) for camera in orbit(scene, 360)[:LEAD_IN_FRAMES]]
     folding = [
-        _compare_along(ctx, scene, cameras, suffix, found) for cameras, suffix in ((fixed, ""), (moving, "_moving"))
+        _compare_along(ctx, scene, cameras, suffix, found)
+        for cameras, suffix in progress(((fixed, ""), (moving, "_moving")), "comparing", unit="paths")
     ]
     found["reference"] |= {
         "folding_psnr": min(psnr for psnr, _ in folding),
@@ -195,7 +197,8 @@ def _compare_along(
     renderers = {level: Renderer(ctx, scene, quality) for level, quality in LEVELS.items()}
     psnrs: dict[str, list[float]] = {level: [] for level in LEVELS}
     drawn: dict[str, Any] = {}
-    for camera, time in zip(cameras, frame_times(scene, len(cameras), COMPARED_TIME), strict=True):
+    times = frame_times(scene, len(cameras), COMPARED_TIME)
+    for camera, time in in_parts(list(zip(cameras, times, strict=True))):
         exact = np.clip(renderers["reference"].render(camera, float(time)).rgb, 0, 1)
         drawn = {level: renderer.render(camera, float(time)) for level, renderer in renderers.items()}
         for level, picture in drawn.items():

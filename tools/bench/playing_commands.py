@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 from kpc.format.common import cli
+from kpc.format.common.progress import progress
 from kpc.format.container import scene_io
 from kpc.player.quality import DEFAULT, LEVELS
 from kpc.tools.bench import harness, pacing, playback_stability, player_bench, streaming_bench, web_bench, web_loading
@@ -178,7 +179,7 @@ def _web_loading(options: argparse.Namespace, origin: Record) -> Iterator[Record
     for source in options.scenes:
         record = harness.new_record("webload", source, origin, {})
         print(f"kpbench: {record['name']}, loading", file=sys.stderr)
-        repeats = [web_loading.measure(source) for _ in range(options.repeats)]
+        repeats = [web_loading.measure(source) for _ in progress(range(options.repeats), "loading", unit="repeats")]
         for player, first in repeats[0].items():
             settings = {"player": player, "size": size_text(web_loading.SIZE), "shows": first["shows"]}
             measured = [{key: value for key, value in found[player].items() if key != "shows"} for found in repeats]

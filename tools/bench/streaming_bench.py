@@ -18,6 +18,7 @@ import numpy as np
 
 from kpc.format.common.errors import KpcError
 from kpc.format.common.fidelity import psnr_from_mse
+from kpc.format.common.progress import Progress, in_parts, progress
 from kpc.format.container.partial import PartialScene
 from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.container.sources import open_source
@@ -59,13 +60,19 @@ def measure(job: Loading) -> dict[str, Any]:
     ctx = offscreen.open_context()
     screen = ctx.simple_framebuffer(job.size, components=4)
     found: dict[str, Any] = {"size_bytes": job.scene.stat().st_size}
-    _load(ctx, screen, job, str(job.scene))  # fills the driver's shader cache for all measurements that follow
-    found |= {f"disk_{key}": value for key, value in _load(ctx, screen, job, str(job.scene)).items()}
-    with served(job.scene, "--rate", RATE, "--delay", DELAY) as url:
-        found |= {f"network_{key}": value for key, value in _load(ctx, screen, job, url).items()}
-    if read(job.scene).is_dynamic:
-        with TemporaryDirectory() as folder, served(_repeated(job.scene, Path(folder))) as url:
-            found |= _seeks(ctx, screen, job, url)
+    is_dynamic = read(job.scene).is_dynamic
+    with Progress("loading", 3 + is_dynamic, "measurements") as bar:
+        _load(ctx, screen, job, str(job.scene))  # fills the driver's shader cache for all measurements that follow
+        bar.advance()
+        found |= {f"disk_{key}": value for key, value in _load(ctx, screen, job, str(job.scene)).items()}
+        bar.advance()
+        with served(job.scene, "--rate", RATE, "--delay", DELAY) as url:
+            found |= {f"network_{key}": value for key, value in _load(ctx, screen, job, url).items()}
+        bar.advance()
+        if is_dynamic:
+            with TemporaryDirectory() as folder, served(_repeated(job.scene, Path(folder))) as url:
+                found |= _seeks(ctx, screen, job, url)
+            bar.advance()
     return found
 
 
@@ -112,13 +119,13 @@ def _seeks(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Loading, ur
         _upload_until(stream, renderer, lambda: stream.is_settled)
         draw(0.0)
         waits, draws, waited = [], [], 0
-        for time in np.random.default_rng(0).permutation(np.linspace(0.0, 1.0, SEEKS)):
+        for time in in_parts(np.random.default_rng(0).permutation(np.linspace(0.0, 1.0, SEEKS)).tolist()):
             started = clock.perf_counter()
-            stream.set_playhead(Playhead(float(time)))
-            waited += not stream.can_show(float(time))
-            _upload_until(stream, renderer, lambda time=float(time): stream.can_show(time))  # type: ignore[misc]
+            stream.set_playhead(Playhead(time))
+            waited += not stream.can_show(time)
+            _upload_until(stream, renderer, lambda time=time: stream.can_show(time))  # type: ignore[misc]
             loaded = clock.perf_counter()
-            draw(float(time), ResolutionController.of(is_software(ctx)).scale)
+            draw(time, ResolutionController.of(is_software(ctx)).scale)
             waits.append(1e3 * (loaded - started))
             draws.append(1e3 * (clock.perf_counter() - loaded))
     totals = [wait + drawn for wait, drawn in zip(waits, draws, strict=True)]
@@ -140,7 +147,8 @@ def prefixes(job: Loading) -> list[dict[str, Any]]:
     wanted = [reference.render(camera, time).rgb.clip(0, 1) for time in COMPARED_TIMES]
     entries = [scene.entry(int(number)) for number in scene.numbers]
     found = []
-    for at, (entry, number) in enumerate(zip(entries, scene.numbers, strict=True)):
+    numbered = list(zip(entries, scene.numbers, strict=True))
+    for at, (entry, number) in enumerate(progress(numbered, "prefixes", unit="segments")):
         scene.fetch([int(number)])
         after = entries[at + 1] if at + 1 < len(entries) else None
         if after is not None and (after.scale, after.row_start) == (entry.scale, entry.row_start):

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from kpc.format.common.fidelity import psnr
+from kpc.format.common.progress import Progress
 from kpc.format.container import scene_io
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rig import Rig
@@ -52,6 +53,11 @@ class Drawing:
 
 def measure(job: Drawing) -> tuple[str, dict[Setting, Record]]:
     """Return what draws, and what was measured for each level, what `auto` chooses on DEVICES and, if timed, for it."""
+    with Progress("drawing", 5 + job.is_timed * (3 + len(LEVELS)), "runs") as bar:
+        return _measured(job, bar)
+
+
+def _measured(job: Drawing, bar: Progress) -> tuple[str, dict[Setting, Record]]:
     scene = scene_io.read(job.scene).dequantise()
     camera = fit_camera(Rig.of(scene).cameras[0], *job.size)
 
@@ -60,7 +66,9 @@ def measure(job: Drawing) -> tuple[str, dict[Setting, Record]]:
 
     def run(*calls: web_page.Call) -> list[Any]:
         with tempfile.TemporaryDirectory() as folder:
-            return web_page.timed(Path(folder), {job.scene.name: job.scene.read_bytes()}, calls, TIMEOUT_S)
+            found = web_page.timed(Path(folder), {job.scene.name: job.scene.read_bytes()}, calls, TIMEOUT_S)
+        bar.advance()
+        return found
 
     def values(*calls: web_page.Call) -> list[Any]:
         return [result["value"] for result in run(*calls)]
@@ -94,6 +102,7 @@ def measure(job: Drawing) -> tuple[str, dict[Setting, Record]]:
     (drawn,) = values(("picture", [job_of({"level": "fastest", "scale": 0.1})]))
     if not job.is_timed:
         return drawn["name"], measured
+    bar.extend(3 + len(measured))
     ((setting, played),) = _timed(run, job_of, camera, reference, measured).items()
     (played["decode_ms"],) = values(("decode", [job.scene.name]))
     played["python_decode_ms"] = decode_bench.measure(job.scene)["decode_ms"]

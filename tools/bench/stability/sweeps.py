@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from kpc.format.common.progress import in_parts
+
 # One level of an 8-bit picture.
 LEVEL = 1 / 255
 
@@ -61,7 +63,7 @@ def run(sweep: Sweep, values: Sequence[float] | None = None) -> dict[str, Any]:
     """
     points, passes = [], []
     worst, largest = "", 0.0
-    for value in sweep.values if values is None else values:
+    for value in in_parts(sweep.values if values is None else values):
         errors = dict(sweep.measure(value))
         points.append({"value": value, "errors": {name: _finite(error) for name, error in errors.items()}})
         name = max(errors, key=lambda name: errors[name])
