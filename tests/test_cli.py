@@ -175,6 +175,38 @@ def test_commands_that_read_files_alone_refuse_addresses(module: str, capsys: py
     assert ended.value.code == 2 and "download the file and give its path (see" in err and "secret" not in err
 
 
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        ("encoder.cli.kpenc", "set -o s3://bucket/x.kpc"),
+        ("encoder.cli.kpenc", "set -o x.kpc --work s3://bucket/work"),
+        ("encoder.cli.kpposes", "set -o s3://bucket/x.json"),
+        ("player.app.kpplay", "x.kpc --folder s3://bucket/films"),
+        ("tools.cli.kpshare", "x.kpc -o https://mysite.org/scene/"),
+        ("tools.cli.kprender", "x.kpc -o s3://bucket/frames/"),
+        ("tools.cli.kprender", "x.kpc -o https://host/film.mp4"),
+        ("tools.cli.kpexport", "x.kpc -o https://host/points"),
+        ("tools.cli.kpedit", "x.kpc --title x -o s3://bucket/x.kpc"),
+        ("tools.cli.kpjoin", "x.kpc -o s3://bucket/x.kpc"),
+        ("tools.cli.kpbatch", "set -o out --scratch s3://bucket/scratch"),
+        ("tools.cli.contactsheet", "a b -o s3://bucket/x.png"),
+        ("tools.bench.kpbench", "decode x.kpc --out s3://bucket/x.json"),
+        ("tools.bench.kpbench", "report x.json -o s3://bucket/x.html"),
+        ("tools.bench.kpbench", "suite -o s3://bucket/records"),
+        ("tools.bench.plot", "x.json -o s3://bucket/x.svg"),
+    ],
+)
+def test_nothing_is_written_to_an_address(
+    module: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        importlib.import_module(f"kpc.{module}").main(words.split())
+    err = capsys.readouterr().err
+    assert "nothing is written to an address; give a file or folder of this machine" in err and err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("module", ["encoder.cli.kpenc", "tools.cli.kpedit", "tools.cli.kpjoin"])
 def test_errors_of_options_are_one_line(module: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):

@@ -172,7 +172,7 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
         help="folder with videos or images, and poses_bounds.npy, transforms*.json or sparse/0; "
         "or a finished checkpoint, or a .kpc file",
     )
-    parser.add_argument("-o", "--output", type=cli.named_path, help="the .kpc file to write")
+    parser.add_argument("-o", "--output", type=cli.output_path, help="the .kpc file to write")
     _add_training_options(parser)
     _add_dataset_options(parser)
     _add_sound_options(parser)
@@ -295,11 +295,11 @@ def _add_sound_options(parser: argparse.ArgumentParser) -> None:
 
 def _add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--work", type=cli.named_path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)"
+        "--work", type=cli.output_path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)"
     )
     parser.add_argument(
         "--cache",
-        type=cli.named_path,
+        type=cli.output_path,
         metavar="DIR",
         help="folder for decoded pixels, which is kept, and which encodes of one dataset can share, also at the same "
         "time (default: the folder of --work)",

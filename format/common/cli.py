@@ -21,6 +21,9 @@ from kpc.format.common.errors import KpcError, UsageError
 from kpc.format.common.text import escaped, notice, valid_unicode
 from kpc.format.common.version import VERSION
 
+# How addresses begin, such as https://host/ or s3://bucket/.
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+
 # Errors of writing where no space is left, or none that the user may take.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
@@ -304,9 +307,21 @@ def make_folder(path: Path) -> None:
 
 def input_path(text: str) -> Path:
     """Parse the path of a file or folder to read; refuse addresses, which as paths would lose a slash."""
-    if re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", text):
+    if _ADDRESS.match(text):
         raise argparse.ArgumentTypeError("an address cannot be given here; download the file and give its path")
     return named_path(text)
+
+
+def output_name(text: str) -> str:
+    """Return the name of a file or folder to write; refuse addresses, for which folders would be made here."""
+    if _ADDRESS.match(text):
+        raise argparse.ArgumentTypeError("nothing is written to an address; give a file or folder of this machine")
+    return file_name(text)
+
+
+def output_path(text: str) -> Path:
+    """Parse the path of a file or folder to write, as `output_name`."""
+    return Path(output_name(text))
 
 
 def file_name(text: str) -> str:
@@ -330,9 +345,10 @@ def output_file(*suffixes: str) -> Callable[[str], Path]:
     """
 
     def parse(text: str) -> Path:
-        if text.endswith(tuple(filter(None, (os.sep, os.altsep)))) or Path(text).suffix.lower() not in suffixes:
+        path = output_path(text)
+        if text.endswith(tuple(filter(None, (os.sep, os.altsep)))) or path.suffix.lower() not in suffixes:
             raise argparse.ArgumentTypeError(f"{text!r} does not end in {' or '.join(suffixes)}")
-        return Path(text)
+        return path
 
     return parse
 

@@ -135,7 +135,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--folder",
-        type=cli.file_name,
+        type=cli.output_name,
         metavar="DIR",
         help="for screenshots, videos and camera paths; it is made (default: the working directory)",
     )

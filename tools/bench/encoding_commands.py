@@ -93,7 +93,7 @@ def add_parsers(kinds: Any) -> None:
             )
         parser.add_argument(
             "--keep-scenes",
-            type=cli.named_path,
+            type=cli.output_path,
             metavar="DIR",
             help="keep the .kpc files, and the .kpck files for `codec`, here",
         )

@@ -29,7 +29,7 @@ def _command(argv: list[str]) -> None:
     cli.add_version_option(parser)
     parser.add_argument("records", type=cli.named_path, nargs="+", help="files that kpbench --out wrote")
     parser.add_argument(
-        "-o", "--output", type=cli.named_path, required=True, help="the .svg, .png or .pdf file to write"
+        "-o", "--output", type=cli.output_path, required=True, help="the .svg, .png or .pdf file to write"
     )
     options = parser.parse_args(argv)
     from kpc.tools.bench import figures  # here, since --help needs no matplotlib

@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "-o",
         "--output",
-        type=cli.named_path,
+        type=cli.output_path,
         required=True,
         metavar="DIR",
         help="folder of the records; it is made if need be",

@@ -173,7 +173,9 @@ def _parse(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--workers", type=_count, help="jobs at once on this machine (default: by cores and memory)")
     parser.add_argument("--cores", type=_count, default=1, help="of each job, for folders (default: %(default)s)")
     parser.add_argument("--memory", type=memory_size, metavar="3GB", help="of each job, for folders")
-    parser.add_argument("--scratch", type=cli.file_name, metavar="DIR", help="folder of workers for what they work on")
+    parser.add_argument(
+        "--scratch", type=cli.output_name, metavar="DIR", help="folder of workers for what they work on"
+    )
     parser.add_argument("--dry-run", action="store_true", help="only check all jobs and files, and list what is done")
     parser.add_argument("--json", action="store_true", help="print a line of JSON for each event, and the results")
     split = argv.index("--") if "--" in argv else len(argv)

@@ -121,7 +121,7 @@ def _parser() -> argparse.ArgumentParser:
         "scenes", nargs="*", type=cli.input_path, metavar="scene", help=".kpc files, or folders of them"
     )
     parser.add_argument(
-        "-o", "--output", type=cli.named_path, required=True, metavar="DIR", help="the folder to write; it is made"
+        "-o", "--output", type=cli.output_path, required=True, metavar="DIR", help="the folder to write; it is made"
     )
     parser.add_argument(
         "--gallery", type=cli.input_path, metavar="DIR", help="a page that lists all scenes of this folder"

@@ -59,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "-o",
         "--output",
-        type=cli.file_name,
+        type=cli.output_name,
         required=True,
         metavar="DIR|FILE",
         help="what to write; its suffix says which",

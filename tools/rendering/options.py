@@ -178,7 +178,7 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "-o",
         "--output",
-        type=cli.file_name,
+        type=cli.output_name,
         required=True,
         metavar="DIR|FILE",
         help="a folder for pictures (a name without suffix, or with / at its end), "
