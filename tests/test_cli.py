@@ -221,6 +221,7 @@ def test_files_may_stand_on_both_sides_of_an_option(capsys: pytest.CaptureFixtur
     parser.add_argument("-o", required=True)
     given = parser.parse_args(["a", "-o", "b", "c"])
     assert (given.files, given.o) == (["a", "c"], "b")
+    assert parser.parse_args(["-o", "b", "--", "-c.kpc", "d"]).files == ["-c.kpc", "d"]
     for words in (["-o", "b"], ["a"]):
         with pytest.raises(SystemExit, match="2"):
             parser.parse_args(words)

@@ -44,6 +44,7 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         names a file or a full disk; 2 for a usage error; 130 after Ctrl-C or SIGTERM. Any other exception is a bug and
         is raised with its traceback.
     """
+    _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # names may hold what the terminal's encoding lacks
@@ -80,6 +81,20 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
     return code
 
 
+def _open_closed_streams() -> None:
+    """Have standard streams that are closed read and write nothing.
+
+    A file would get their numbers else, and what is meant for them; Python prints on stdout what is meant for none.
+    """
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the system gives the lowest number that is free
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))
+
+
 def message_of(error: KpcError | OSError) -> str | None:
     """Return what to tell the user about an error; None if it is a bug: an OSError without a file or a full disk."""
     if isinstance(error, KpcError):
@@ -100,9 +115,13 @@ class Parser(argparse.ArgumentParser):
     def parse_args(  # type: ignore[override]  # overloads of one meaning
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> Any:
-        """Parse words as argparse does; files may stand before and after options, but where there are subcommands."""
-        parse = super().parse_args if self._subparsers is not None else self.parse_intermixed_args
-        return parse(args, namespace)
+        """Parse words as argparse does; files may stand before and after options, but where there are subcommands.
+
+        Behind "--" all are files; before it, then, none may stand before an option.
+        """
+        words = sys.argv[1:] if args is None else args
+        is_plain = self._subparsers is not None or "--" in words  # which argparse loses among files before and after
+        return super().parse_args(words, namespace) if is_plain else self.parse_intermixed_args(words, namespace)
 
     def parse_known_args(  # type: ignore[override]  # overloads of one meaning
         self, args: Sequence[str] | None = None, namespace: Any = None

@@ -210,9 +210,18 @@ def test_the_input_is_not_overwritten_and_two_cameras_give_no_limits(folder, cap
     assert not read(scene).metadata
 
 
+def test_a_direction_that_stays_is_written_as_before(folder, tmp_path):
+    upright = tmp_path / "upright.kpc"
+    save(replace(small_scene(), metadata=Metadata({"up": [0, 0, 1]})), upright)
+    found = read(edit(folder, "--up", "0,0,2", "--title", "a", scene=str(upright))).metadata.document
+    assert json.dumps(found["up"]) == "[0, 0, 1]" and found["title"] == "a"
+
+
 def test_what_changes_nothing_is_said_or_refused(folder, tmp_path, capsys):
     turns = ["--turn", "x:90", "--turn", "x:-90", "--scale", "1", "--move", "0,0,0"]
-    for words in ([], ["--speed", "1", "--to", "1.1"], ["--fps", "10", *turns], ["--from", "0.01", "--to", "0.99"]):
+    around = ["--box", "-9,-9,-9,9,9,9"]
+    idle = [], around, ["--speed", "1", "--to", "1.1"], ["--fps", "10", *turns], ["--from", "0.01", "--to", "0.99"]
+    for words in idle:
         copy = edit(folder, *words)
         assert "there is nothing to change" in capsys.readouterr().err
         assert copy.read_bytes() == (folder / "scene.kpc").read_bytes()

@@ -135,13 +135,17 @@ def test_the_plan_runs_nothing(machine: Machine, tmp_path: Path, capsys: pytest.
     assert "kpbench player kept/room.kpc --out player.json" in lines[2] and total.split()[0] == "16.0"
 
 
-@pytest.mark.parametrize("commit", [f"{COMMIT}+dirty", "unknown"])
+@pytest.mark.parametrize(
+    ("commit", "said"),
+    [(f"{COMMIT}+dirty", "commit your changes"), ("unknown", "run it from a checkout of KPC in git")],
+)
 def test_code_that_no_commit_holds_is_refused_or_marked(
-    machine: Machine, tmp_path: Path, commit: str, capsys: pytest.CaptureFixture[str]
+    machine: Machine, tmp_path: Path, commit: str, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     machine.commit = machine.commit_after = commit
     assert kpbench.main(["suite", "-o", str(tmp_path)]) == 2 and not machine.ran
-    assert "commit your changes" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert said in err and "--allow-dirty" in err
     for _ in range(2):  # nothing is kept, since nobody knows what changed in between
         assert len(ran(machine, "-o", str(tmp_path), "--allow-dirty")) == 4
     assert json.loads((tmp_path / "player.json").read_text())[0]["commit"] == commit

@@ -4,6 +4,7 @@ import errno
 import io
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -36,6 +37,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     except OSError:
         pytest.skip("this file system holds Unicode names only")
     return renamed
+
+
+@pytest.mark.parametrize("closed", ["2>&-", "0<&-", "0<&- 1>&- 2>&-"])
+def test_standard_streams_may_be_closed(closed: str, tmp_path: Path) -> None:
+    scene = tiny_scene()
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]), tmp_path / "a.kpc")
+    film = "kprender a.kpc --backend reference --size 16x12 --to 0.2 -o a.mp4"
+    for words in (film, "kpedit a.kpc --turn x:90 -o b.kpc", "kpexport a.kpc -o c.gltf"):
+        command, _, options = words.partition(" ")
+        call = f"{shlex.quote(sys.executable)} -m kpc.tools.cli.{command} {options} {closed}"
+        done = subprocess.run(["sh", "-c", call], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, (words, done.stderr)
+        assert command not in done.stdout, "what is meant for stderr is printed on stdout"
+        assert (tmp_path / words.split()[-1]).stat().st_size > 100
 
 
 def test_commands(folder: bytes, monkeypatch: pytest.MonkeyPatch) -> None:

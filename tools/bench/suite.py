@@ -45,9 +45,12 @@ def main(argv: Sequence[str]) -> None:
         print(plan(steps, options.output, work, commit))
         return
     if not is_clean(commit) and not options.allow_dirty:
+        remedy = f"the code is of commit {commit}: commit your changes"
+        if commit == "unknown":
+            remedy = "the code is of no commit: run it from a checkout of KPC in git"
         raise UsageError(
-            f"the code is of commit {commit}: commit your changes, so that records say what they measured; "
-            "--allow-dirty measures all the same, and marks the records"
+            f"{remedy}, so that records say what they measured; --allow-dirty measures all the same, and marks the "
+            "records"
         )
     work.mkdir(parents=True, exist_ok=True)
     for folder in options.scene:  # so that commands, which records hold, name no place on this machine

@@ -42,10 +42,10 @@ from kpc.format.container.metadata_options import (
 from kpc.format.container.rewriting import save, with_metadata
 from kpc.format.scene.cameras import Camera, load_views
 from kpc.format.scene.metadata import HISTORY_LIMIT, Metadata, camera_document
-from kpc.format.scene.scene import Clip
 from kpc.format.scene.view_limits import find_view, view_members
 from kpc.player.cpu import reference
 from kpc.tools.editing.clips import Edits, edit
+from kpc.tools.editing.cropping import holds_all
 from kpc.tools.editing.placing import Placement, axis_turn
 from kpc.tools.editing.timing import MAX_FPS, MIN_FPS
 
@@ -60,7 +60,7 @@ def _command(argv: list[str]) -> None:
     cli.refuse_sources(options.output, options.scene)
     cli.check_writable(options.output)
     groups = Groups(options.scene)
-    _drop_idle(options, groups.clip)
+    _drop_idle(options, groups)
     edits = _edits_from(options)
     if groups.clip.frame_count == 1 and (edits.speed is not None or edits.fps is not None):
         raise UsageError("--fps, --speed: the scene is static; it has no frames to show at another rate")
@@ -195,12 +195,15 @@ def _turn_of(options: argparse.Namespace) -> np.ndarray:
     return turn
 
 
-def _drop_idle(options: argparse.Namespace, clip: Clip) -> None:
+def _drop_idle(options: argparse.Namespace, groups: Groups) -> None:
     """Set options that change nothing to None, so that they leave no figures out and no line in the history."""
+    clip = groups.clip
     if options.start == 0:
         options.start = None
     if options.end is not None and clip.duration_s <= options.end <= clip.total_s + cli.TIME_SLACK_S:
         options.end = None
+    if options.box is not None and holds_all(groups, np.reshape(options.box, (2, 3))):
+        options.box = None
     if options.scale == 1:
         options.scale = None
     if np.allclose(_turn_of(options), np.eye(3), rtol=0, atol=1e-12):
@@ -244,6 +247,8 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement:
     if options.transparent is not None:
         members["transparent"] = options.transparent or None
     is_upright = _has_direction(metadata.up, members.get("up"))
+    if is_upright:
+        members.pop("up", None)  # it stays as it was written
     metadata = _with_limits(metadata.with_members(**members), options, is_upright)
     if options.open_at is not None:
         view = load_views(options.open_at)[0]

@@ -33,6 +33,12 @@ def cropped(scene: QuantisedScene, box: np.ndarray, shared: SharedTexels | None 
     return without_unread(replace(scene, occupancy=occupancy), scene.occupancy, shared)
 
 
+def holds_all(clip: Groups, box: np.ndarray) -> bool:
+    """Return whether a box touches all that any group holds, so that nothing is cropped."""
+    scenes = (PartialScene(clip.open(number)).scene for number in range(len(clip)))
+    return not any((scene.occupancy & ~_touched_cells(scene, box)).any() for scene in scenes)
+
+
 def shared_texels(clip: Groups, numbers: Sequence[int], box: np.ndarray) -> list[SharedTexels]:
     """Return for each of some groups what any of them reads in a box of the planes that it shares."""
     found: dict[tuple[int, ...], np.ndarray] = {}  # by chunk and shape
