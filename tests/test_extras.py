@@ -124,7 +124,8 @@ def test_what_is_missing_is_named_in_one_line(
     done = run((missing,), call, *words.split())
     name = "plot" if call.endswith("plot.main") else call.partition(".")[2]
     assert done.returncode == 1
-    assert done.stderr == f'{name}: needs {missing}, which is not installed; pip install "kpc[{extra}]"\n'
+    lacks = "finding cameras needs COLMAP" if extra == "poses" else f"needs {missing}, which is not installed"
+    assert done.stderr == f'{name}: {lacks}; pip install "kpc[{extra}]"\n'
 
 
 def test_what_no_extra_brings_is_a_bug() -> None:

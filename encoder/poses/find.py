@@ -15,7 +15,16 @@ from kpc.encoder.poses.footage import Footage, find_footage, frame_size
 from kpc.encoder.poses.given_clocks import read_clocks
 from kpc.encoder.poses.instants import Picture, grey_of, moving_pictures, still_pictures
 from kpc.encoder.poses.orientation import extent
-from kpc.encoder.poses.structure import ALL, MANY, Pairing, PlacedView, Structure, oriented, reconstruct
+from kpc.encoder.poses.structure import (
+    ALL,
+    MANY,
+    Pairing,
+    PlacedView,
+    Structure,
+    check_installed,
+    oriented,
+    reconstruct,
+)
 from kpc.encoder.poses.survey import Survey, frame_count, survey
 from kpc.encoder.poses.sync import SURE, clocks_by_motion, clocks_by_sound, wants_motion
 from kpc.encoder.poses.takes import Take, frame_names, pairing_of, pictures_of, take_of
@@ -68,10 +77,12 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
     """Find cameras and clocks of the footage in a folder; say in one line what it is taken for.
 
     Raises:
-        DatasetError: the footage cannot be used, or fewer than LEAST_CAMERAS views could be placed.
+        DatasetError: the footage cannot be used, COLMAP is not installed, or fewer than LEAST_CAMERAS views could be
+            placed.
         MediaError: a file cannot be read.
     """
     footage = find_footage(root)
+    check_installed()
     counts = [frame_count(one) for one in footage]
     if max(counts) == 1 and footage[0].video is not None:
         raise DatasetError(f"{root}: its videos have one frame each; give whole videos, or photographs as images")

@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -217,6 +218,16 @@ def _compared(pictures: list[dict], pairing: Pairing, cameras: Sequence[int]) ->
     return found
 
 
+def check_installed() -> None:
+    """Check, before work that would be lost, that COLMAP is installed.
+
+    Raises:
+        DatasetError: it is not.
+    """
+    if find_spec("pycolmap") is None:
+        raise DatasetError(extras.remedy("pycolmap", "kpposes"))
+
+
 def _run_worker(folder: Path) -> None:
     command = [sys.executable, "-m", "kpc.encoder.poses.colmap_worker", str(folder)]
     # Pairs are matched in threads of their own; those of the matrix product would only get in their way.
@@ -234,8 +245,6 @@ def _run_worker(folder: Path) -> None:
             raise
     if process.returncode:
         said = (folder / "log").read_text(errors="replace")
-        if "No module named 'pycolmap'" in said:
-            raise DatasetError(f"finding cameras needs COLMAP: {extras.install('poses')}")
         last = said.strip().splitlines()[-1:] or ["no message"]
         raise DatasetError(f"COLMAP ended with code {process.returncode} ({last[0][:200]}); try again, or report it")
 

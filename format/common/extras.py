@@ -15,6 +15,9 @@ PACKAGES = {
 # The extras that a command needs anyway, where several bring a package.
 NEEDED = {"kpenc": ("encoder",), "kpposes": ("encoder",), "kpbench": ("bench", "encoder")}
 
+# What is said of packages of an extra that do not speak for themselves.
+SAID = {"poses": "finding cameras needs COLMAP"}
+
 
 def install(extra: str) -> str:
     """Return the shell command that adds an extra to the KPC that is installed."""
@@ -31,5 +34,5 @@ def remedy(missing: str | None, command: str) -> str | None:
     package = (missing or "").partition(".")[0]
     for extra in (*NEEDED.get(command, ()), *PACKAGES):
         if package in PACKAGES[extra]:
-            return f"needs {package}, which is not installed; {install(extra)}"
+            return f"{SAID.get(extra, f'needs {package}, which is not installed')}; {install(extra)}"
     return None

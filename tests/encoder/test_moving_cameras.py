@@ -1,6 +1,7 @@
 """Several cameras that move: where and when their pictures were taken, what is said of them, and what is refused."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -204,6 +205,13 @@ def test_a_film_of_one_frame_is_refused(films):
     film(films / "c.mp4", count=1)
     with pytest.raises(DatasetError, match=r"c\.mp4 has one frame, beside cameras that move; remove it"):
         find.find_poses(films, MOVING)
+
+
+def test_colmap_is_missed_before_the_footage_is_looked_at(films, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    monkeypatch.setattr(find, "survey", lambda *_: pytest.fail("the footage is looked at"))
+    with pytest.raises(DatasetError, match=r'^finding cameras needs COLMAP; pip install "kpc\[poses\]"$'):
+        find.find_poses(films, Wishes())
 
 
 def test_films_of_one_frame_are_no_photographs(tmp_path):
