@@ -273,9 +273,8 @@ def _has_alpha(image: Image.Image) -> bool:
 def _alpha(image: Image.Image) -> np.ndarray:
     """Return straight alpha, (H, W) uint8."""
     if image.mode in ("1", "L", "RGB") or image.mode.startswith("I"):  # one level or colour is transparent
-        raw = _raw_mode(image)
-        scale = 255 if image.mode == "1" else {"L;2": 85, "L;4": 17}.get(raw, 1)
-        same = np.asarray(image) == np.multiply(image.info["transparency"], scale)
+        marked = np.multiply(image.info["transparency"], {"L;2": 85, "L;4": 17}.get(_raw_mode(image), 1))
+        same = np.asarray(image) == (marked > 0 if image.mode == "1" else marked)  # of mode 1, white is 1 or 255
         return np.where(same.all(axis=-1) if image.mode == "RGB" else same, 0, 255).astype(np.uint8)
     straight = image.convert("LA") if image.mode == "La" else image
     return np.asarray(straight.convert("RGBA").getchannel("A"))

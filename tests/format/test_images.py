@@ -88,9 +88,10 @@ def rgb(grey: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("bits", [1, 2, 4, 8, 16])
 @pytest.mark.parametrize("transparent", [False, True])
-def test_grey_png(tmp_path: Path, bits: int, transparent: bool) -> None:
+@pytest.mark.parametrize("place", [0, 1])
+def test_grey_png(tmp_path: Path, bits: int, transparent: bool, place: int) -> None:
     values = samples(bits, 1)
-    key = int(values[1, 1, 0])
+    key = int(values[0, place, 0])  # the lowest, or the highest
     write_png(tmp_path / "x.png", values, bits, 0, **({"tRNS": struct.pack(">H", key)} if transparent else {}))
     read = read_image(tmp_path / "x.png")
     np.testing.assert_array_equal(read[..., :3], rgb(as_8_bits(values, bits)))
