@@ -215,6 +215,10 @@ test('every kind of error is a sentence', () => {
   assert.match(messageOf('blocked', 'file:///home/a.kpc'), /^A page cannot read files of a disk\..*\.$/);
   assert.match(messageOf('not-found', 'ftp://a.example/b.kpc'), /^A page cannot fetch .* "ftp:"\..*\.$/);
   assert.match(messageOf('not-found', 'http://['), /^There is no such file/);
+  const answered = (status: string) =>
+    playerErrorOf(new KpcError(`b.kpc: the server answers ${status}; check the address`, 'network'), '', '').message;
+  assert.match(answered('403 Forbidden'), /^The server does not permit everyone .*\(403\)\.$/);
+  assert.match(answered('500'), /^The server does not send .* 500\. Try again later\.$/);
   assert.equal(playerErrorOf('odd', '', '').code, 'unknown');
 });
 

@@ -40,7 +40,7 @@ function sentenceOf(code: PlayerErrorCode, detail: string, src: string, origin: 
       if (src.startsWith('file:')) return 'A page cannot read files of a disk. Open the file by kpplay --web instead.';
       return `${serverOf(src, origin)} does not let this page read the file. Its answers need the header Access-Control-Allow-Origin: ${origin}`;
     case 'network':
-      return 'The file cannot be fetched. Check the connection, then try again.';
+      return refusalOf(detail) ?? 'The file cannot be fetched. Check the connection, then try again.';
     case 'replaced':
       return 'The file was replaced while it was read. Try again to see the new one.';
     case 'empty':
@@ -67,6 +67,16 @@ function sentenceOf(code: PlayerErrorCode, detail: string, src: string, origin: 
     default:
       return `The scene cannot be shown: ${detail}.`;
   }
+}
+
+/** Return a sentence for a server that answers with an error; null where there is no answer. */
+function refusalOf(detail: string): string | null {
+  const status = /the server answers (\d+)/.exec(detail)?.[1];
+  if (status === undefined) return null;
+  if (['401', '402', '403', '407'].includes(status)) {
+    return `The server does not permit everyone to read the file (${status}).`;
+  }
+  return `The server does not send the file; it answers with the error ${status}. Try again later.`;
 }
 
 /** Return what refuses a page of an origin to read from an address. */
