@@ -32,12 +32,11 @@ class _Handler(Handler):
 
     def answer_request(self, answer_folder: "Callable[[], None]") -> None:
         """Answer a request that names this machine: a page whose name was made to lead here could read the files."""
-        names = ("localhost", "127.0.0.1", "[::1]")
-        host, port = self.headers.get("Host", ""), self.connection.getsockname()[1]
-        if host.lower() in [f"{name}:{port}" for name in names]:
+        host = self.headers.get("Host", "").lower().rpartition(":")[0]  # a tunnel may have another port
+        if host in ("localhost", "127.0.0.1", "[::1]"):
             super().answer_request(answer_folder)
         else:
-            self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
+            self.send_error(HTTPStatus.MISDIRECTED_REQUEST, explain="Only localhost, with its port, is answered.")
 
     def translate_path(self, path: str) -> str:
         """Return the file that a request means."""

@@ -375,13 +375,14 @@ def test_a_browser_gets_page_player_and_scene(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "host", ["a.example", "a.example:{port}", "127.0.0.1", "localhost:1", "127.0.0.1.a.example:{port}"]
+    "host", ["a.example", "a.example:{port}", "127.0.0.1", "localhost.a.example:1", "127.0.0.1.a.example:{port}"]
 )
 def test_names_that_were_made_to_lead_here_are_refused(host: str) -> None:
     with serving_pages([str(SAMPLE)]) as url:
         port = url.rstrip("/").rpartition(":")[2]
         for name in "localhost", "LOCALHOST", "127.0.0.1", "[::1]":
             assert read(url, Host=f"{name}:{port}")[0]
+        assert read(url, Host="localhost:1")[0]  # as through a tunnel
         for path in "", "default.kpc":
             with pytest.raises(urllib.error.HTTPError, match="421"):
                 read(url + path, Host=host.format(port=port))

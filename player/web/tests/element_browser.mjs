@@ -266,6 +266,28 @@ scenario('says why the picture is waited for, once that takes long', async () =>
   await close(page);
 });
 
+scenario('says that a server does not answer, and takes the focus', async () => {
+  const before = (page) => page.route('**/scene.kpc', () => {});
+  const page = await open(TAG, { before });
+  await until(page, (it) => /^Waiting for the begin/.test(it.shadowRoot.querySelector('.waiting').textContent));
+  assert.equal(await player(page, (it) => it.readyState), 0);
+  await player(page, (it) => it.focus());
+  assert.ok(await player(page, (it) => document.activeElement === it && it.shadowRoot.activeElement !== null));
+  await close(page);
+});
+
+scenario('shows its switches in forced colours', async () => {
+  const page = await open(TAG, { context: { forcedColors: 'active' } });
+  await shown(page);
+  await button(page, 'Settings').click();
+  const looks = await player(page, (it) =>
+    [...it.shadowRoot.querySelectorAll('input[type="checkbox"]')].map((one) => getComputedStyle(one).appearance),
+  );
+  assert.ok(looks.length > 0 && looks.every((look) => look === 'auto'), looks.join());
+  await page.screenshot({ path: join(folder, 'forced.png') });
+  await close(page);
+});
+
 scenario('is turned by the mouse, and goes on for a moment', async () => {
   const page = await open(`${TAG}<div style="height: 2000px"></div>`);
   await shown(page);
@@ -962,6 +984,7 @@ for (const [name, context] of Object.entries(SCREENS)) {
 scenario('can be seen in the colours that a user forces', async () => {
   const page = await open(TAG, { context: { forcedColors: 'active' } });
   await shown(page);
+  await button(page, 'Settings').click();
   const colours = await inside(page, '.bar').evaluate((bar) => {
     const [play, bare] = ['.button', '.track'].map((name) => getComputedStyle(bar.querySelector(name)));
     return [play.color, getComputedStyle(bar).backgroundColor, bare.backgroundColor];

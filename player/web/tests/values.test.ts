@@ -38,6 +38,13 @@ class Player extends AudibleElement {
   }
 }
 
+test('camera-controls is off by its word as a property, too', () => {
+  const player = new Player();
+  player.controls = true;
+  player.cameraControls = 'none';
+  assert.equal(player.cameraControls, false);
+});
+
 test('booleans are true or false whatever is set', () => {
   for (const name of ['controls', 'autoplay', 'loop', 'playsInline', 'muted', 'cameraControls'] as const) {
     const player = new Player();

@@ -117,6 +117,11 @@ export class KpcPlayer extends AudibleElement implements Model {
     this.#refresh();
   }
 
+  /** Give the keyboard to the player, whose keys act on its picture. */
+  override focus(options?: FocusOptions): void {
+    this.#ui.stage.focus(options);
+  }
+
   // --- playing
 
   /** A file that the page has, in place of `src`. */
@@ -457,7 +462,7 @@ export class KpcPlayer extends AudibleElement implements Model {
       isMovable: this.cameraControls,
       isShown,
       isWaiting: isStarting || (isShown && (clock.isSeeking || clock.isWaiting)),
-      reason: session?.clip?.message ?? null,
+      reason: session?.clip ? session.clip.message : 'waiting for the beginning of the file',
       isOffered: !this.#hasPlayed && clock.paused && (session === null ? this.src !== '' : duration > 0 && !isStarting),
       paused: clock.paused,
       ended: clock.ended,

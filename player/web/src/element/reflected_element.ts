@@ -76,8 +76,8 @@ export class ReflectedElement extends Base {
     return string(this, 'camera-controls', this.controls ? '' : 'none').toLowerCase() !== 'none';
   }
 
-  set cameraControls(value: boolean) {
-    set(this, 'camera-controls', value ? '' : 'none');
+  set cameraControls(value: boolean | 'none') {
+    set(this, 'camera-controls', value && value !== 'none' ? '' : 'none');
   }
 
   get quality(): Level | 'auto' {

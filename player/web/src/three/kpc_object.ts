@@ -63,7 +63,7 @@ export class KpcObject extends Mesh<BoxGeometry, MeshBasicMaterial, KpcObjectEve
   /** The clip, once its header has arrived. */
   clip: Clip | null = null;
   /** Why it cannot be shown; null if it can. */
-  error: Error | null = null;
+  error: (Error & { code?: string }) | null = null;
   /** The box that the scene fills; what lies around it, if anything, is shown, too. */
   readonly box = new Box3();
   readonly #src: string | URL | Blob;
