@@ -13,7 +13,14 @@ from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation.ablations import ABLATIONS, BASELINE
 from kpc.encoder.evaluation.testing_time import FEWEST_PICTURES
 from kpc.encoder.field.appearances import choose_appearance
-from kpc.encoder.field.config import APPEARANCES, PRESETS, PROGRESSIVE_SCALE_DROPOUT, REFINEMENTS, TrainConfig
+from kpc.encoder.field.config import (
+    APPEARANCES,
+    OBJECT_LENGTH,
+    PRESETS,
+    PROGRESSIVE_SCALE_DROPOUT,
+    REFINEMENTS,
+    TrainConfig,
+)
 from kpc.encoder.poses.wishes import Wishes, add_pose_options, wishes_from
 from kpc.encoder.rdo.codec_model import is_coded
 from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, Trade
@@ -221,7 +228,12 @@ def _add_training_options(parser: argparse.ArgumentParser) -> None:
         "in which it moves; one: all scales hold both (default: %(default)s)",
     )
     steps = ", ".join(f"{name} {config.steps:,}" for name, config in sorted(PRESETS.items()))
-    parser.add_argument("--steps", type=_positive, help=f"optimiser steps (default, by preset: {steps})")
+    parser.add_argument(
+        "--steps",
+        type=_positive,
+        help=f"optimiser steps (default, by preset: {steps}; "
+        f"{OBJECT_LENGTH} times as many, but for paper, for an object on its own that one moving camera filmed)",
+    )
     parser.add_argument(
         "--time-budget", type=cli.duration_s, metavar="10m", help="train for so long instead of a number of steps"
     )

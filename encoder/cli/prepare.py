@@ -151,6 +151,8 @@ def prepare_trainer(options: Options, setting: Setting) -> Trainer:
     config, resolution = fit_frames_per_row(options.config(dataset), dataset)
     if dataset.is_dynamic:
         log(describe_time_rows(config, dataset, resolution))
+    if config.motion_cells:
+        log(f"model: a motion grid and {config.steps:,} steps, for an object on its own that one moving camera filmed")
     if setting.refined != "none":
         config = replace(config, refine="none")
         log("cameras: as refined in the first group")

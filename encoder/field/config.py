@@ -286,9 +286,12 @@ class TrainConfig:
             view_dependent=False,
             robust_tv_from=1.0,
             samples_across=max(32, self.samples_across // 2),
-            steps=3 * self.steps,
+            steps=OBJECT_LENGTH * self.steps,
         )
 
+
+# `steps` of an object on its own that one moving camera filmed, as a multiple of the preset's.
+OBJECT_LENGTH = 3
 
 # `scale_dropout` of scenes that are to be shown while they are being received.
 PROGRESSIVE_SCALE_DROPOUT = 0.1
