@@ -25,7 +25,9 @@ from kpc.format.common.errors import UsageError
 from kpc.format.common.images import srgb_from_linear, write_image
 from kpc.format.common.progress import progress
 from kpc.format.scene.cameras import Camera
+from kpc.format.scene.rig import look_at
 from kpc.tools.dev.processes import end_with_parent
+from kpc.tools.editing.placing import axis_turn
 
 # Distance of the cameras from the origin, which they look at, in metres, and their angles of view and elevation.
 DISTANCE = 3.2
@@ -69,13 +71,9 @@ class Part:
         return self.start + self.length * self.turn[:, 2]
 
 
-def _about(axis: int, angle: float) -> np.ndarray:
-    """Return the rotation (3, 3) by an angle in radians about x, y or z, axis 0, 1 or 2."""
-    c, s = math.cos(angle), math.sin(angle)
-    turn = np.eye(3)
-    j, k = (axis + 1) % 3, (axis + 2) % 3
-    turn[j, j], turn[j, k], turn[k, j], turn[k, k] = c, -s, s, c
-    return turn
+def _about(axis: str, angle: float) -> np.ndarray:
+    """Return the rotation (3, 3) by an angle in radians about "x", "y" or "z"."""
+    return axis_turn(axis, math.degrees(angle))
 
 
 def parts(time: float, turns: float = Options.turns) -> list[Part]:
@@ -86,22 +84,22 @@ def parts(time: float, turns: float = Options.turns) -> list[Part]:
     """
     beat = 2 * math.pi * turns * time
     hip = np.array([0.12 * math.sin(beat / 2), 0.08 * math.sin(beat), 0.12 * math.sin(beat) ** 2 - 0.08])
-    body = _about(2, 0.9 * math.sin(beat / 2))
-    torso = Part(hip, body @ _about(1, 0.22 * math.sin(beat)), 0.5, 0.12, (0.55, 0.12, 0.1))
+    body = _about("z", 0.9 * math.sin(beat / 2))
+    torso = Part(hip, body @ _about("y", 0.22 * math.sin(beat)), 0.5, 0.12, (0.55, 0.12, 0.1))
     neck = torso.end + 0.2 * torso.turn[:, 2]
-    head = Part(neck, torso.turn @ _about(0, 0.3 * math.sin(beat)), 0.1, 0.13, (0.75, 0.5, 0.35))
+    head = Part(neck, torso.turn @ _about("x", 0.3 * math.sin(beat)), 0.1, 0.13, (0.75, 0.5, 0.35))
     found = [torso, head]
     for side in (-1, 1):
         swing = math.sin(beat + side * math.pi / 2)
         shoulder = torso.end + side * 0.2 * torso.turn[:, 0]
-        down = torso.turn @ _about(0, math.pi)
-        upper_turn = down @ _about(1, side * (1.1 + 0.9 * swing)) @ _about(0, 0.5 * swing)
+        down = torso.turn @ _about("x", math.pi)
+        upper_turn = down @ _about("y", side * (1.1 + 0.9 * swing)) @ _about("x", 0.5 * swing)
         upper = Part(shoulder, upper_turn, 0.34, 0.055, (0.1, 0.3, 0.6))
-        lower = Part(upper.end, upper.turn @ _about(0, -0.7 - 0.6 * swing), 0.34, 0.045, (0.7, 0.55, 0.1))
-        thigh_turn = body @ _about(0, math.pi) @ _about(0, 0.7 * swing) @ _about(1, side * 0.2)
+        lower = Part(upper.end, upper.turn @ _about("x", -0.7 - 0.6 * swing), 0.34, 0.045, (0.7, 0.55, 0.1))
+        thigh_turn = body @ _about("x", math.pi) @ _about("x", 0.7 * swing) @ _about("y", side * 0.2)
         thigh = Part(hip + side * 0.11 * body[:, 0], thigh_turn, 0.4, 0.07, (0.12, 0.4, 0.16))
-        shin = Part(thigh.end, thigh.turn @ _about(0, 0.6 - 0.55 * swing), 0.4, 0.05, (0.4, 0.14, 0.45))
-        foot = Part(shin.end, shin.turn @ _about(0, 1.4 + 0.3 * swing), 0.16, 0.045, (0.05, 0.05, 0.06))
+        shin = Part(thigh.end, thigh.turn @ _about("x", 0.6 - 0.55 * swing), 0.4, 0.05, (0.4, 0.14, 0.45))
+        foot = Part(shin.end, shin.turn @ _about("x", 1.4 + 0.3 * swing), 0.16, 0.045, (0.05, 0.05, 0.06))
         found += [upper, lower, thigh, shin, foot]
     return found
 
@@ -188,9 +186,7 @@ def cameras(number: int, options: Options, stream: int) -> list[Camera]:
                 math.sin(elevation),
             ]
         )
-        right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(back, right), back, DISTANCE * back], axis=1)
+        pose = look_at(DISTANCE * back, np.zeros(3), np.array([0.0, 0.0, 1.0]))
         found.append(Camera(options.size, options.size, focal, focal, options.size / 2, options.size / 2, pose))
     return found
 

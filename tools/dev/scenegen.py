@@ -29,6 +29,7 @@ from kpc.format.common.films import write_video
 from kpc.format.common.images import srgb_from_linear, write_image
 from kpc.format.common.progress import progress
 from kpc.format.scene.cameras import Camera
+from kpc.format.scene.rig import look_at
 from kpc.tools.dev.processes import end_with_parent
 from kpc.tools.dev.scene_geometry import CONTENTS, moving_objects
 from kpc.tools.dev.scene_shading import StaticView
@@ -55,14 +56,9 @@ class Options:
     content: str = "full"  # a key of CONTENTS
 
 
-def look_at(eye: np.ndarray, options: Options) -> Camera:
+def _camera(eye: np.ndarray, options: Options) -> Camera:
     """Return a camera at `eye` (3,) that looks at TARGET with z up; it is about 50 degrees wide."""
-    back = eye - np.array(TARGET)
-    back /= np.linalg.norm(back)
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)
+    pose = look_at(eye, np.array(TARGET), np.array([0.0, 0.0, 1.0]))
     focal = 1.06 * options.width
     return Camera(options.width, options.height, focal, focal, options.width / 2, options.height / 2, pose)
 
@@ -71,7 +67,7 @@ def _at(azimuth: float, elevation: float, distance: float, options: Options) -> 
     """Return a camera by its angles in degrees: azimuth 0 looks along +y, elevation 0 is level."""
     a, e = math.radians(azimuth), math.radians(elevation)
     offset = distance * np.array([math.sin(a) * math.cos(e), -math.cos(a) * math.cos(e), math.sin(e)])
-    return look_at(np.array(TARGET) + offset, options)
+    return _camera(np.array(TARGET) + offset, options)
 
 
 def rig(options: Options) -> list[Camera]:

@@ -17,6 +17,7 @@ from kpc.encoder.field.field import Field
 from kpc.encoder.field.render import Rays, render_reference
 from kpc.format.common.errors import DisplayError
 from kpc.format.scene.cameras import Camera
+from kpc.format.scene.rig import look_at
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, Clip, Decoder, Scene
 from kpc.format.scene.space import DeviceCoordinates
 from kpc.player.cpu import reference
@@ -76,14 +77,10 @@ def soft_scene(
 
 def camera_at(eye: np.ndarray, target: np.ndarray, half_width: float = 0.4, size: tuple[int, int] = SIZE) -> Camera:
     """Return a camera that looks at a target, at whose distance its picture is two `half_width` wide, z being up."""
-    back = np.asarray(eye, np.float64) - target
-    distance = np.linalg.norm(back)
-    back = back / distance
-    up = np.array([0.0, 0, 1]) if abs(back[2]) < 0.9 else np.array([0.0, 1, 0])
-    right = np.cross(up, back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)
+    offset = np.asarray(eye, np.float64) - target
+    distance = np.linalg.norm(offset)
+    up = np.array([0.0, 0, 1]) if abs(offset[2]) < 0.9 * distance else np.array([0.0, 1, 0])
+    pose = look_at(eye, target, up)
     focal = size[0] / 2 * float(distance) / half_width
     return Camera(*size, focal, focal, size[0] / 2, size[1] / 2, pose)
 
