@@ -38,7 +38,7 @@ function sentenceOf(code: PlayerErrorCode, detail: string, src: string, origin: 
         : `A page cannot fetch addresses that begin with "${strangeScheme(src)}". Use one that begins with "https:".`;
     case 'blocked':
       if (src.startsWith('file:')) return 'A page cannot read files of a disk. Open the file by kpplay --web instead.';
-      return `${serverOf(src, origin)} does not let this page read the file. Its answers need the header Access-Control-Allow-Origin: ${origin}`;
+      return refusalToRead(serverOf(src, origin), `Access-Control-Allow-Origin: ${origin}`);
     case 'network':
       return refusalOf(detail) ?? 'The file cannot be fetched. Check the connection, then try again.';
     case 'replaced':
@@ -77,6 +77,11 @@ function refusalOf(detail: string): string | null {
     return `The server does not permit everyone to read the file (${status}).`;
   }
   return `The server does not send the file; it answers with the error ${status}. Try again later.`;
+}
+
+/** Return a sentence for a server whose answers lack a header, without which the page may not read them. */
+function refusalToRead(server: string, header: string): string {
+  return `${server} does not let this page read the file. Its answers need the header ${header}`;
 }
 
 /** Return what refuses a page of an origin to read from an address. */
