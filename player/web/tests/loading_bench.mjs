@@ -157,12 +157,15 @@ async function seeks() {
       if (buffered.start(i) <= time && time <= buffered.end(i)) return [buffered.start(i), buffered.end(i)];
     return null;
   };
+  /** The player says within a frame that a time is there, and then draws it. */
   const seek = async (time) => {
     const start = performance.now();
+    const seeked = new Promise((resolve) => {
+      player.addEventListener('seeked', () => resolve(document.timeline.currentTime), { once: true });
+    });
     player.currentTime = time;
-    while (player.seeking) await nextFrame();
-    const seeked = document.timeline.currentTime;
-    const isDone = (_, frame) => frames[frame] >= seeked;
+    const since = await seeked;
+    const isDone = (_, frame) => frames[frame] >= since;
     while (!done.some(isDone)) await nextFrame();
     return done.find(isDone) - start;
   };
