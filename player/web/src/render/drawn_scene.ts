@@ -55,8 +55,10 @@ export class DrawnScene {
     const atOnce = device.isSoftware ? BYTES_AT_ONCE.processor : BYTES_AT_ONCE.card;
     for (let bytes = 0; bytes < BYTES_A_FRAME; bytes += atOnce) {
       const taken = [...this.source.take(atOnce)];
-      for (const rows of taken) textures.put(rows);
-      if (taken.length) folded?.planesChanged();
+      for (const rows of taken) {
+        const block = textures.put(rows);
+        folded?.planeChanged(block);
+      }
       if (taken.length === 0 || performance.now() > due) break;
     }
   }

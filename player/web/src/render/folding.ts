@@ -1,6 +1,6 @@
 /** Folding: once a frame, the time rows are multiplied into the space planes, as kpc.player.gl.folding explains. */
 
-import { isFoldedAlongRows, Layout, rowWidth, timeRows } from './atlas.js';
+import { type Block, isFoldedAlongRows, Layout, rowWidth, timeRows } from './atlas.js';
 import { bytesOf, type Device, type Framebuffer, type Texture } from './device.js';
 import { type Programs, type SceneTextures, UNIT } from './scene_textures.js';
 
@@ -20,7 +20,8 @@ export class FoldedPlanes {
   readonly #foldInto: Framebuffer;
   /** Time and version of the folded planes. */
   #folded = '';
-  #isUpsampled = false;
+  /** Blocks of the scene that are upsampled as they are. */
+  readonly #upsampledBlocks = new Set<Block>();
 
   constructor(
     readonly textures: SceneTextures,
@@ -50,32 +51,35 @@ export class FoldedPlanes {
     return [this.#upsampled, this.#rows, this.#planes].reduce((sum, texture) => sum + bytesOf(texture), 0);
   }
 
-  planesChanged(): void {
-    this.#isUpsampled = false;
+  planeChanged(block: Block): void {
+    this.#upsampledBlocks.delete(block);
     this.#folded = '';
   }
 
-  /** Return the planes at a time in [0, 1]. */
+  /** Return the planes at a time in [0, 1]. Scales that lack a plane stay 0, as textures are made. */
   at(time: number): Texture {
-    if (!this.#isUpsampled) {
-      this.#device.use(this.textures.planes, UNIT.planes);
-      this.#drawBlocks(FOLDING[0], this.#upsampleInto);
-      this.#isUpsampled = true;
-    }
     const { scene, layout } = this.textures;
     const key = `${time} ${scene.version}`;
     if (key !== this.#folded) {
+      const blocks = this.textures.featured;
+      this.#device.use(this.textures.planes, UNIT.planes);
+      this.#drawBlocks(
+        FOLDING[0],
+        this.#upsampleInto,
+        blocks.filter((block) => !this.#upsampledBlocks.has(block)),
+      );
+      for (const block of blocks) this.#upsampledBlocks.add(block);
       this.#device.write(this.#rows, timeRows(scene, layout, time, this.layout.upsampling));
       this.#device.use(this.#upsampled, UNIT.planes);
       this.#device.use(this.#rows, UNIT.rows);
-      this.#drawBlocks(FOLDING[1], this.#foldInto);
+      this.#drawBlocks(FOLDING[1], this.#foldInto, blocks);
       this.#folded = key;
     }
     return this.#planes;
   }
 
-  /** Draw each plane by a shader that takes as uniforms where it lies and which rows go with it. */
-  #drawBlocks(name: string, into: Framebuffer): void {
+  /** Draw planes by a shader that takes as uniforms where each lies and which rows go with it. */
+  #drawBlocks(name: string, into: Framebuffer, blocks: readonly Block[]): void {
     const source = this.textures.layout;
     const program = this.programs.get(name, source);
     this.#device.set(program, {
@@ -84,8 +88,8 @@ export class FoldedPlanes {
       folded_rows_texel: this.#rows.size.map((side) => 1 / side),
       largest: LARGEST_HALF,
     });
-    for (const [i, block] of source.blocks.entries()) {
-      const written = this.layout.blocks[i];
+    for (const block of blocks) {
+      const written = this.layout.block(block.scale, block.plane);
       this.#device.set(program, {
         source: source.textureRectangle(block),
         source_width: block.width / source.width,

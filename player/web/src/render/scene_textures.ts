@@ -1,12 +1,19 @@
 /** The textures of a scene, and the programs that read them. */
 
 import { FeatureAreas } from './areas.js';
-import { displacementsAt, Layout, rowWidth, timeRows } from './atlas.js';
+import { type Block, displacementsAt, Layout, rowWidth, timeRows } from './atlas.js';
 import { columnsOf } from './camera.js';
 import { RenderError } from './context.js';
 import { bytesOf, type Device, type Program, type Texture } from './device.js';
 import { SceneNumbers } from './scene_numbers.js';
-import { occupancySlot, occupiedIn, type PlaneRows, type SceneSource, type SpacePlane } from './scene_source.js';
+import {
+  occupancySlot,
+  occupiedIn,
+  type PlaneRows,
+  type SceneSource,
+  SPACE_PLANES,
+  type SpacePlane,
+} from './scene_source.js';
 import type { Defines, Written } from './shader.js';
 import { decoderShape, planesShape } from './shader_constants.js';
 import { SharedPrograms } from './shared_programs.js';
@@ -34,6 +41,8 @@ export class SceneTextures {
   readonly motion: Texture | null = null;
   /** Areas of the scales, as far as planes have been put. */
   readonly areas: FeatureAreas;
+  /** Blocks of the layout of which rows have been put; the others are 0. */
+  readonly #filled = new Set<Block>();
   /** The slot whose cells are there, and whether with their distances. */
   #slot = '';
   /** Time and version of the rows. */
@@ -55,12 +64,23 @@ export class SceneTextures {
     if (motion) this.motion = device.texture(filtered, motion.sizes.slice(1).reverse(), true);
   }
 
-  /** Replace rows of a space plane. */
-  put(rows: PlaneRows): void {
+  /** Replace rows of a space plane; return its block. */
+  put(rows: PlaneRows): Block {
     const { scale, plane, firstRow, rowCount, texels } = rows;
     this.areas.put(rows);
-    const { x, y, width } = this.layout.block(scale, plane as SpacePlane);
+    const block = this.layout.block(scale, plane as SpacePlane);
+    const { x, y, width } = block;
     this.device.write(this.planes, texels, x, y + firstRow, [width * this.layout.layers[scale], rowCount]);
+    this.#filled.add(block);
+    return block;
+  }
+
+  /** Blocks whose product with the others of their scale, the features, may be other than 0. */
+  get featured(): Block[] {
+    const { blocks } = this.layout;
+    return blocks.filter(({ scale }) =>
+      SPACE_PLANES.every((plane) => this.#filled.has(this.layout.block(scale, plane))),
+    );
   }
 
   setTimeRows(time: number): void {
