@@ -24,7 +24,7 @@ function noting() {
   return { device: device as unknown as Device & { isCompiling: boolean }, done, begin };
 }
 
-test('scenes of the same shape share a program until the last lets go of it', () => {
+test('scenes of the same shape share a program, which is kept for a while for those to come', () => {
   const { device, done, begin } = noting();
   const [first, second] = [{}, {}];
   const shared = SharedPrograms.on(device);
@@ -37,15 +37,27 @@ test('scenes of the same shape share a program until the last lets go of it', ()
   shared.release(first);
   assert.deepEqual(done, ['compile a']);
   shared.release(second);
-  assert.deepEqual(done, ['compile a', 'release a']);
+  assert.deepEqual(shared.get(first, 'a', begin('a')), [program, true]); // whose uniforms may be of a scene that is gone
+  shared.release(first);
+  for (const name of 'bcdefghi') shared.get(second, name, begin(name));
+  shared.get(second, 'b', begin('b'));
+  shared.release(second);
+  assert.deepEqual(done.slice(9), ['release a']); // eight others were needed after it
+  shared.dispose();
+  assert.deepEqual(
+    done.slice(10).sort(),
+    [...'bcdefghi'].map((name) => `release ${name}`),
+  );
 });
 
-test('a program that nobody waits for any more is given up', () => {
+test('a program that is being compiled for nobody is given up at the end', () => {
   const { device, done, begin } = noting();
   device.isCompiling = true;
   const shared = SharedPrograms.on(device);
   assert.ok(!shared.isReady(done, 'a', begin('a')));
   shared.release(done);
+  assert.deepEqual(done, ['compile a']);
+  shared.dispose();
   assert.deepEqual(done, ['compile a', 'abandon a']);
 });
 

@@ -94,10 +94,9 @@ export class Picture {
     return this.#renderer.drawInto(frames, this.#scenes.moments(clip, time), options).pictures;
   }
 
-  /** Have shaders compiled for all scenes of a clip, before there is anything to draw; return whether all are. */
+  /** Have made what drawing needs for all scenes of a clip, before there is anything to draw; return whether it is. */
   prepare(clip: Clip, camera: Camera, { level, part }: ShownOptions): boolean {
-    const areReady = this.#scenes.all(clip).map((moment) => this.#renderer.prepare(camera, [moment], { level, part }));
-    return areReady.every((isReady) => isReady);
+    return this.#renderer.prepare(camera, this.#scenes.all(clip), { level, part });
   }
 
   /** Forget a scene that the clip no longer holds. */

@@ -10,14 +10,13 @@ export class CompiledPrograms {
 
   /**
    * Whether a program is there, so that `get` does not wait. It is taken while nothing is being compiled or
-   * drawn, which the page would wait for, too. As many are begun and taken as a frame has time for.
+   * drawn, which the page would wait for, too. As many are taken as a frame has time for.
    * @param begin begins to compile it, if that has not been done.
    */
   isReady(key: string, begin: () => Compilation, made?: (program: Program) => void): boolean {
     if (this.#programs.has(key)) return true;
-    if (performance.now() > this.device.takesUntil) return false;
     this.#begun(key, begin);
-    if (this.device.isCompiling) return false;
+    if (this.device.isCompiling || performance.now() > this.device.takesUntil) return false;
     this.get(key, begin, made);
     return true;
   }

@@ -89,7 +89,7 @@ export class Device {
   /** Signalled once the card has made the textures that `hasMemory` asks for. */
   #question: WebGLSync | null = null;
   readonly #vertices: WebGLVertexArrayObject;
-  /** Until when programs may be begun and taken in this frame: each waits a little for the card. */
+  /** Until when programs may be taken in this frame: each waits a little for the card. */
   takesUntil = 0;
   readonly #compiling = new Set<Compilation>();
   readonly #parallel: KHR_parallel_shader_compile | null;

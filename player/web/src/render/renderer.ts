@@ -17,6 +17,7 @@ import { type Keeping, type Moment, type Picture, PictureJob, type ShownPart, ty
 import { Presentation, type Screen } from './presentation.js';
 import { LEVEL_NAMES, LEVELS, type Level } from './quality.js';
 import type { SceneSource } from './scene_source.js';
+import { SharedPrograms } from './shared_programs.js';
 import { Timer } from './timer.js';
 
 export interface DrawOptions {
@@ -72,7 +73,7 @@ const ASSUMED_SECONDS = { card: 2e-7, processor: 1e-5 };
 const FPS = { card: 30, processor: 10 };
 /** Rays for a pixel of the first pictures on a card, before it is known how fast it is. */
 export const FIRST_RAYS = 0.1;
-/** Milliseconds of a frame after which programs that are to be compiled, or are, wait for the next one. */
+/** Milliseconds of a frame after which programs that are compiled wait for the next one. */
 const TAKING_MS = 4;
 /** How fast what is known of it follows what is measured. */
 const NEW_WEIGHT = 0.5;
@@ -179,13 +180,16 @@ export class Renderer {
     if (this.#scenes.delete(scene)) scene.release();
   }
 
-  /** Have shaders compiled that `draw` will need, while planes are still to come; return whether all are. */
+  /** Have made what `draw` will need for each moment by itself, while planes are still to come; return whether it is. */
   prepare(camera: Camera, moments: readonly Moment[], options: DrawOptions = {}): boolean {
     if (this.isLost) return true;
     // Nothing is given to the card while it is asked whether it has memory; then textures are made before it is asked.
     if (this.#device.isAsked && !this.#hasMemory()) return false;
-    const isReady = this.#isReady(viewOf(camera, moments, options), this.#wanted(camera, moments, options));
-    return this.#hasMemory() === true && isReady;
+    const areReady = moments.map((moment) => {
+      const view = viewOf(camera, [moment], options);
+      return this.#isReady(view, this.#wanted(camera, view.moments, options));
+    });
+    return this.#hasMemory() === true && areReady.every((isReady) => isReady);
   }
 
   /**
@@ -414,6 +418,7 @@ export class Renderer {
 
   #releaseAll(): void {
     for (const scene of this.#scenes) scene.release();
+    SharedPrograms.on(this.#device).dispose();
     this.#timer.dispose();
     this.#presentation.release();
     this.#merging?.release();
