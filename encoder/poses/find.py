@@ -13,8 +13,9 @@ from kpc.encoder.poses.doubts import MATCHED, by_camera, doubts
 from kpc.encoder.poses.false_views import without_false_views
 from kpc.encoder.poses.footage import Footage, find_footage, frame_size
 from kpc.encoder.poses.given_clocks import read_clocks
+from kpc.encoder.poses.gravity import LEAST_TAGS, agreed_up, tagged_up
 from kpc.encoder.poses.instants import Picture, grey_of, moving_pictures, still_pictures
-from kpc.encoder.poses.orientation import extent
+from kpc.encoder.poses.orientation import extent, up_direction
 from kpc.encoder.poses.structure import (
     ALL,
     MANY,
@@ -377,8 +378,38 @@ def _scaled(root: Path, found: Found, wishes: Wishes) -> Found:
             raise DatasetError(f"{root}: --distance {one},{two}: both must be cameras that were placed")
         first, second = (views[number].camera_to_world[:3, 3] for number in numbers)
         scale = metres / max(float(np.linalg.norm(first - second)), 1e-12)
-    structure = oriented(found.structure, scale)
+    structure = oriented(found.structure, _up(root, found), scale)
     return replace(found, structure=structure, is_metric=is_metric)
+
+
+def _up(root: Path, found: Found) -> np.ndarray:
+    """Return what is up, (3,), by the gravity tags of placed images, else by the cameras; say by which in one line."""
+    views, files = found.structure.views, _images(found)
+    votes = [
+        view.camera_to_world[:3, :3] @ up
+        for number, view in views.items()
+        if number in files and (up := tagged_up(files[number])) is not None
+    ]
+    agreed = agreed_up(np.array(votes).reshape(-1, 3))
+    if agreed is not None:
+        notice(f"{root}: up follows gravity: {agreed.agreeing} of {counted(len(votes), 'gravity tag')} agree")
+        return agreed.up
+    tags = counted(len(votes), "gravity tag")
+    why = f"{tags} disagree" if len(votes) >= LEAST_TAGS else f"only {tags}" if votes else "no gravity tags"
+    notice(f"{root}: up follows from how the cameras are held ({why})")
+    return up_direction(np.stack([view.camera_to_world for view in views.values()]))
+
+
+def _images(found: Found) -> dict[int, Path]:
+    """Return the file of each view that is an image; the first of a camera that stands still."""
+    if found.take is None:
+        return {number: one.files[0] for number, one in enumerate(found.footage) if one.video is None}
+    return {
+        view: one.files[frame]
+        for one, track in zip(found.footage, found.take.tracks, strict=True)
+        if one.video is None
+        for view, frame in zip(track.views, track.frames, strict=False)
+    }
 
 
 def depth_range(structure: Structure, number: int, view: PlacedView) -> tuple[float, float] | None:

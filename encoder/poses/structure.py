@@ -15,7 +15,7 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import opengl_pose
 from kpc.encoder.poses.instants import Picture
-from kpc.encoder.poses.orientation import looked_at, up_direction
+from kpc.encoder.poses.orientation import looked_at
 from kpc.format.common import extras
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.progress import Progress
@@ -293,10 +293,9 @@ def _read(folder: Path) -> Structure:
     )
 
 
-def oriented(structure: Structure, scale: float) -> Structure:
-    """Return the structure turned to z up, with its origin where the cameras look, `scale` times as large."""
+def oriented(structure: Structure, up: np.ndarray, scale: float) -> Structure:
+    """Return the structure turned so that `up`, (3,), is z, with its origin where the cameras look, scaled."""
     poses = np.stack([view.camera_to_world for view in structure.views.values()])
-    up = up_direction(poses)
     forward = -poses[:, :3, 2].mean(0)
     y = forward - (forward @ up) * up
     if np.linalg.norm(y) < 1e-6:

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageCms, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import MediaError
@@ -38,6 +38,7 @@ _MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK"
 
 # Tags of TIFF and EXIF.
 _SUBFILE_TYPE, _BITS, _PHOTOMETRIC, _ORIENTATION, _PLANAR, _SAMPLE_FORMAT = 254, 258, 262, 274, 284, 339
+_MAKER_NOTE, _LENS_MODEL = 0x927C, 0xA434
 
 # Transfer curves of HDR, by their numbers in ITU-T H.273.
 _HDR_CURVES = {16: "PQ", 18: "HLG"}
@@ -70,6 +71,23 @@ class ImageInfo:
         return (self.width, self.height) if self.orientation < 5 else (self.height, self.width)
 
 
+@dataclass(frozen=True)
+class CameraTags:
+    """What a camera wrote beside a picture. All but the orientation is data of unknown origin.
+
+    Attributes:
+        orientation: as that of `ImageInfo`.
+        maker_note: EXIF's MakerNote; empty without one.
+        lens: EXIF's LensModel; empty without one.
+        xmp: the packet of XMP; empty without one.
+    """
+
+    orientation: int = 1
+    maker_note: bytes = b""
+    lens: str = ""
+    xmp: bytes = b""
+
+
 def image_info(path: str | os.PathLike[str]) -> ImageInfo:
     """Return an image's properties, from its header.
 
@@ -83,6 +101,31 @@ def image_info(path: str | os.PathLike[str]) -> ImageInfo:
             orientation = _orientation(image)
             size = image.size[::-1] if image.format == "TIFF" and orientation >= 5 else image.size
             return ImageInfo(*size, _has_alpha(image), orientation)
+
+
+def camera_tags(path: str | os.PathLike[str]) -> CameraTags:
+    """Return what a camera wrote beside a picture; tags that cannot be read are left out.
+
+    Raises:
+        MediaError: as `read_image`.
+    """
+    with _image_errors(path):
+        if is_exr(path):
+            return CameraTags()
+        with _opened(path) as image:
+            orientation = _orientation(image)
+            try:
+                details = Image.Image.getexif(image).get_ifd(ExifTags.IFD.Exif)
+                note, lens = details.get(_MAKER_NOTE), details.get(_LENS_MODEL)
+            except _DAMAGE:
+                note, lens = None, None
+            xmp = image.info.get("xmp")
+            return CameraTags(
+                orientation,
+                note if isinstance(note, bytes) else b"",
+                lens if isinstance(lens, str) else "",
+                xmp if isinstance(xmp, bytes) else b"",
+            )
 
 
 def read_image(path: str | os.PathLike[str], *, upright: bool = False) -> np.ndarray:
