@@ -53,6 +53,7 @@ def describe_origin(options: Options, dataset: Dataset, cameras: list[int], data
     metadata = Metadata().with_members(
         **options.members,
         transparent=True if dataset.has_alpha else None,
+        up=[0.0, 0.0, 1.0] if dataset.poses_found else None,  # kpposes may know gravity, which the cameras do not show
         camera_names=[_printable(name) for name in names] or None,
     )
     return metadata.with_provenance(
@@ -67,6 +68,7 @@ def describe_origin(options: Options, dataset: Dataset, cameras: list[int], data
 
 def with_view(metadata: Metadata, scene: Scene, wanted: str | Mapping[str, Any] | None) -> Metadata:
     """Return the metadata with up, an opening view and view limits, as --view-limits asks."""
+    scene = replace(scene, metadata=metadata)  # whose up counts, if it is known
     renderer = SceneRenderer(scene)
 
     def look(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

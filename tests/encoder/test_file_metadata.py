@@ -52,6 +52,17 @@ def test_a_file_says_how_it_was_made(dataset: Dataset) -> None:
     pack_metadata(found)  # a reader accepts it
 
 
+def test_up_is_that_of_kpposes_if_it_found_the_cameras(dataset: Dataset) -> None:
+    options, *_ = parse(["set", "-o", "out.kpc"])
+    scene = scene_of_five()
+    given, found = (
+        describe(options, replace(dataset, poses_found=known), scene, [0, 2], "0" * 64) for known in (False, True)
+    )
+    assert given.up == pytest.approx(Rig.of(scene).up, abs=1e-3) and given.up != pytest.approx([0, 0, 1], abs=0.5)
+    assert found.up == pytest.approx([0, 0, 1])
+    pack_metadata(found)  # limits are perpendicular to it
+
+
 def test_the_hash_of_a_dataset_is_that_of_its_files_and_cameras(dataset: Dataset) -> None:
     known = hash_dataset(dataset)
     assert known == hash_dataset(dataset)
