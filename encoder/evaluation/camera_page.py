@@ -112,6 +112,7 @@ def write_camera_page(
     columns: Sequence[str] = (),
     points: np.ndarray | None = None,
     curves: Sequence[Curve] = (),
+    up: np.ndarray | None = None,
 ) -> None:
     """Write the page.
 
@@ -123,11 +124,12 @@ def write_camera_page(
         columns: headings of their facts.
         points: (N, 3) of the scene, drawn with the cameras; None if unknown.
         curves: of motion, one below another; what belongs together is in line if clocks are right.
+        up: (3,) unit vector, the direction that is up in the drawings; None for what the cameras say.
     """
     parts = [f"<h1>{escape(title)}</h1>", *(f"<p>{escape(line)}</p>" for line in lines)]
     placed = [camera for camera in cameras if camera.pose is not None]
     if placed:
-        parts.append(_drawings(placed, np.zeros((0, 3)) if points is None else points))
+        parts.append(_drawings(placed, np.zeros((0, 3)) if points is None else points, up))
     if columns:
         rows = "".join(
             f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in (camera.name, *camera.facts))}</tr>"
@@ -182,9 +184,9 @@ def write_page_of_dataset(file: Path, dataset: Dataset, lines: Sequence[str]) ->
     write_camera_page(file, f"Cameras of {dataset.path.name}", lines, cameras)
 
 
-def _drawings(cameras: Sequence[ShownCamera], points: np.ndarray) -> str:
+def _drawings(cameras: Sequence[ShownCamera], points: np.ndarray, up_in_world: np.ndarray | None) -> str:
     poses = np.stack([camera.pose for camera in cameras if camera.pose is not None])
-    axes = _axes(poses)
+    axes = _axes(poses, up_direction(poses) if up_in_world is None else up_in_world)
     some = points[spread(len(points), POINTS)] if len(points) else points
     reach = np.concatenate([poses[:, :3, 3], some]) @ axes.T
     low, high = np.quantile(reach, 0.02, axis=0), np.quantile(reach, 0.98, axis=0)
@@ -217,9 +219,8 @@ def _drawings(cameras: Sequence[ShownCamera], points: np.ndarray) -> str:
     return f'<div class="pair">{"".join(figures)}</div>'
 
 
-def _axes(poses: np.ndarray) -> np.ndarray:
+def _axes(poses: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return rows right, forwards and up, (3, 3)."""
-    up = up_direction(poses)
     forward = -poses[:, :3, 2].mean(0)
     forward = forward - (forward @ up) * up
     if np.linalg.norm(forward) < 0.05:  # cameras all around

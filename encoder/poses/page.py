@@ -46,7 +46,8 @@ def write_page(found: Found, title: str, file: Path) -> None:
         for one, clock, motion in zip(found.footage, found.clocks, found.motion, strict=False)
         if len(motion) > 2
     ]
-    write_camera_page(file, title, said, cameras, columns, found.structure.points, curves)
+    z = np.array([0.0, 0.0, 1.0])
+    write_camera_page(file, title, said, cameras, columns, found.structure.points, curves, z)
 
 
 def _shown(found: Found) -> dict[int, tuple[Footage, int]]:

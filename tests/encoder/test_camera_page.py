@@ -94,3 +94,19 @@ def test_a_dataset_is_shown(tmp_path: Path) -> None:
 def test_one_camera_is_shown(tmp_path: Path, shown: list[ShownCamera]) -> None:
     write_camera_page(tmp_path / "cameras.html", "one", [], shown[:1])
     assert "nan" not in Reader((tmp_path / "cameras.html").read_text()).drawn
+
+
+def test_drawings_have_up_above(tmp_path: Path, shown: list[ShownCamera]) -> None:
+    """Two cameras one above the other, which both look down, are at one place as seen from above."""
+    sine, cosine = np.sin(np.radians(50)), np.cos(np.radians(50))
+    pose = np.eye(4)
+    pose[:3, :3] = [[1, 0, 0], [0, sine, -cosine], [0, cosine, sine]]
+    above = pose + np.eye(4, k=1) * [[0], [0], [1], [0]]
+    cameras = [replace(camera, pose=at) for camera, at in zip(shown, (pose, above), strict=False)]
+    eyes = {}
+    for name, up in (("known", np.array([0.0, 0.0, 1.0])), ("by the cameras", None)):
+        write_camera_page(tmp_path / "cameras.html", "x", [], cameras, up=up)
+        first = (tmp_path / "cameras.html").read_text().partition("From the side")[0]
+        eyes[name] = re.findall(r'class="camera" d="M([\d.-]+ [\d.-]+)L', first)
+    assert len(eyes["known"]) == 2 and len(set(eyes["known"])) == 1
+    assert len(set(eyes["by the cameras"])) == 2
