@@ -15,6 +15,9 @@ SIZE = WIDTH, HEIGHT = 256, 192
 FOCAL = 240.0
 FPS = 20.0
 
+# Walls: the axis that is across each and where, the axes along it, and the seed of its texture.
+WALLS = ((2, 0.0, (0, 1), 1), (1, 1.6, (0, 2), 2), (0, -1.8, (1, 2), 3))
+OTHER_WALLS = ((0, 3.5, (1, 2), 4), (2, 3.0, (0, 1), 5), (1, -6.0, (0, 2), 6))
 PERIOD = 768  # texels, at 128 a metre: more than is seen, since repeated patterns match wrongly
 
 
@@ -27,12 +30,14 @@ class RigCamera:
         pose: camera to world in the OpenGL convention, (4, 4).
         late: by how many frames its film is late.
         focal: pixels.
+        is_fisheye: whether a place's distance from the middle grows with the angle from the axis, not its tangent.
     """
 
     name: str
     pose: np.ndarray
     late: int = 0
     focal: float = FOCAL
+    is_fisheye: bool = False
 
 
 def rig(count: int = 5, late: tuple[int, ...] = ()) -> list[RigCamera]:
@@ -107,14 +112,13 @@ def _texture(seed: int) -> np.ndarray:
 
 
 def _walls(camera: RigCamera) -> np.ndarray:
-    """Return the picture of floor, back and side wall, (H, W, 3) float64, by intersecting rays with the three."""
-    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    rays = (
-        np.stack([(x - WIDTH / 2) / camera.focal, -(y - HEIGHT / 2) / camera.focal, -np.ones_like(x)], axis=-1)
-        @ camera.pose[:3, :3].T
-    )
+    """Return the picture of floor, back and side wall, (H, W, 3) float64, by intersecting rays with the three.
+
+    A fisheye lens sees the rest of the room, too.
+    """
+    rays = _looks(camera) @ camera.pose[:3, :3].T
     centre, picture, nearest = camera.pose[:3, 3], np.zeros((HEIGHT, WIDTH, 3)), np.full((HEIGHT, WIDTH), np.inf)
-    for axis, level, along, seed in ((2, 0.0, (0, 1), 1), (1, 1.6, (0, 2), 2), (0, -1.8, (1, 2), 3)):
+    for axis, level, along, seed in WALLS + (OTHER_WALLS if camera.is_fisheye else ()):
         with np.errstate(divide="ignore"):
             depth = (level - centre[axis]) / rays[..., axis]
         hit = (depth > 0) & (depth < nearest)
@@ -123,6 +127,17 @@ def _walls(camera: RigCamera) -> np.ndarray:
         colours = _texture(seed)[row, column]
         picture[hit], nearest[hit] = colours[hit], depth[hit]
     return picture
+
+
+def _looks(camera: RigCamera) -> np.ndarray:
+    """Return where the pixels look in the camera's frame, (H, W, 3) float64."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    right, up = (x - WIDTH / 2) / camera.focal, -(y - HEIGHT / 2) / camera.focal
+    if not camera.is_fisheye:
+        return np.stack([right, up, -np.ones_like(x)], axis=-1)
+    angle = np.hypot(right, up)
+    share = np.sinc(angle / np.pi)
+    return np.stack([right * share, up * share, -np.cos(angle)], axis=-1)
 
 
 def _with_block(still: np.ndarray, camera: RigCamera, time: float) -> np.ndarray:

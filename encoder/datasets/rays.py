@@ -43,7 +43,7 @@ def pixel_rays(
     """
     fl_x, fl_y, cx, cy = pictures.intrinsics[picture].T
     x, y = (column + 0.5 - cx) / fl_x, (row + 0.5 - cy) / fl_y
-    local = _local_directions(x, y, pictures.distortion[picture], pictures.is_fisheye[picture])
+    local = local_directions(x, y, pictures.distortion[picture], pictures.is_fisheye[picture])
     return _rays_through(*local, pictures.camera_to_world[picture], mapping)
 
 
@@ -74,7 +74,7 @@ def covering_pinholes(pictures: Pictures) -> np.ndarray:
         width, height = float(pictures.width[p]), float(pictures.height[p])
         fl_x, fl_y, cx, cy = pictures.intrinsics[p]
         number = np.full(len(edge_x), p)
-        x, y, z = _local_directions(
+        x, y, z = local_directions(
             (edge_x * width - cx) / fl_x,
             (edge_y * height - cy) / fl_y,
             pictures.distortion[number],
@@ -87,10 +87,19 @@ def covering_pinholes(pictures: Pictures) -> np.ndarray:
     return covering
 
 
-def _local_directions(
+def local_directions(
     x: np.ndarray, y: np.ndarray, distortion: np.ndarray, is_fisheye: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return directions in the camera's frame, y down and z forward, through normalised points of pictures."""
+    """Return directions in the camera's frame, y down and z forward, through normalised points of pictures.
+
+    Args:
+        x, y: (N,) coordinates normalised by focal length and principal point, y down.
+        distortion: (N, 8) coefficients DISTORTION_KEYS.
+        is_fisheye: (N,) bool, whether they are those of the fisheye model.
+
+    Returns:
+        x and y, (N,) each, and z, (N,), or (1,) of pinholes alone: of depth 1, or for fisheye lenses of length 1.
+    """
     if distortion.any():
         x, y = undistort(x, y, distortion, is_fisheye)
     if not is_fisheye.any():

@@ -11,31 +11,15 @@ too; all matches of two views then count together.
 
 import json
 import sys
-from collections.abc import Iterator
-from itertools import combinations, islice
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
+from kpc.encoder.poses.lenses import AssumedLens, assumed_lens, is_fisheye, projections, rays, with_best_cameras
 from kpc.encoder.poses.matching import alike_pairs, match_pairs, strongest
-
-# A camera model with more parameters is taken if it lowers n log(sum of squared errors) by so many times log(n) for
-# each: the Bayesian information criterion has 1, but errors of one point in many views are not independent.
-EVIDENCE = 4.0
-# Camera models in the order in which they are tried, by their parameters beside the principal point.
-MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-
-# An adjustment ends once a step lowers the cost by less than this share: COLMAP's own default takes four times as long
-# for the same result.
-TOLERANCE = 1e-6
-
-# Camera models are compared on about so many observations of points.
-COMPARED = 100_000
-
-# The camera model while views are placed.
-FIRST_MODEL = "SIMPLE_RADIAL"
 
 # Views that a model has at least.
 LEAST_VIEWS = 3
@@ -49,9 +33,6 @@ CONFIRMED = 2.0
 # Mean distance in pixels between points and where they were found, below which a model of all views is believed.
 GOOD_ERROR = 1.0
 
-# Focal length by the larger side of the picture before anything is known, as COLMAP assumes it.
-FOCAL = 1.2
-
 # Pictures whose features are found between two lines of progress.
 BATCH = 16
 
@@ -64,13 +45,17 @@ def main(folder: Path) -> None:
     pictures = _features(folder, job)
     matches = _matches(job, pictures)
     database = folder / "views.db"
-    _write_views(database, job, [keypoints for keypoints, _ in pictures], matches)
+    keypoints = _of_views(job, [places for places, _ in pictures])
+    sizes = [job["cameras"][view["camera"]]["size"] for view in job["views"]]
+    lens = assumed_lens(keypoints, sizes, matches, _tolerance(max(map(max, sizes))))
+    _write_views(database, job, keypoints, matches, lens)
     _verify(database, job)
-    model, apart = _reconstruct(folder, database, job)
+    model, apart = _reconstruct(folder, database, job, lens)
     found: dict[str, Any] = {"views": {}, "apart": apart}
     arrays: dict[str, Any] = {}
     if model is not None:
-        model = _with_best_cameras(model, job["lenses"])
+        _say("adjusting lenses", 0, 1)
+        model = with_best_cameras(model, job["lenses"])
         found["views"], arrays = _views(model), _points(model)
     found["pairs"] = _pairs(database, model)
     np.savez(folder / "result.npz", **arrays)
@@ -153,15 +138,26 @@ def _starts(job: dict[str, Any], counts: list[int]) -> list[int]:
     return starts
 
 
+def _of_views(job: dict[str, Any], of_pictures: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the keypoints of each view, one picture after another."""
+    found: list[list[np.ndarray]] = [[] for _ in job["views"]]
+    for picture, keypoints in zip(job["pictures"], of_pictures, strict=True):
+        found[picture["view"]].append(keypoints)
+    return [np.concatenate(own).astype(np.float32) for own in found]
+
+
 def _write_views(
-    file: Path, job: dict[str, Any], keypoints: list[np.ndarray], matches: dict[tuple[int, int], np.ndarray]
+    file: Path,
+    job: dict[str, Any],
+    keypoints: list[np.ndarray],
+    matches: dict[tuple[int, int], np.ndarray],
+    lens: AssumedLens,
 ) -> None:
     """Write views, their keypoints and the matches into a new database; numbers count from 1 there."""
     file.unlink(missing_ok=True)
     database = pycolmap.Database.open(file)
     for number, camera in enumerate(job["cameras"], 1):
-        width, height = camera["size"]
-        model = pycolmap.Camera.create_from_model_name(number, FIRST_MODEL, FOCAL * max(width, height), width, height)
+        model = lens.camera(number, *camera["size"])
         database.write_camera(model, use_camera_id=True)
         rig = pycolmap.Rig(rig_id=number)
         rig.add_ref_sensor(model.sensor_id)
@@ -173,8 +169,7 @@ def _write_views(
         database.write_frame(frame, use_frame_id=True)
         image.frame_id = number
         database.write_image(image, use_image_id=True)
-        own = [k for k, picture in zip(keypoints, job["pictures"], strict=True) if picture["view"] == number - 1]
-        database.write_keypoints(number, np.concatenate(own).astype(np.float32))
+        database.write_keypoints(number, keypoints[number - 1])
     for (one, two), pairs in matches.items():
         if len(pairs):
             database.write_matches(one + 1, two + 1, pairs)
@@ -225,15 +220,13 @@ def _confirmed(model: pycolmap.Reconstruction, one: int, two: int, in_one: np.nd
     """Return the share of matches that lie on each other's epipolar lines, by Sampson's distance, (M, 2) pixels."""
     images = [model.images[number] for number in (one, two)]
     cameras = [model.cameras[image.camera_id] for image in images]
-    a, b = (
-        np.pad(camera.cam_from_img(at), ((0, 0), (0, 1)), constant_values=1.0)
-        for camera, at in zip(cameras, (in_one, in_two), strict=True)
-    )
+    a, b = (rays(camera, at) for camera, at in zip(cameras, (in_one, in_two), strict=True))
+    axes = 3 if is_fisheye(cameras[0]) else 2  # in which a place deviates: of a sphere, or of a plane
     relative = (images[1].cam_from_world() * images[0].cam_from_world().inverse()).matrix()
     x, y, z = relative[:, 3]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:, :3]
     lines_two, lines_one = a @ essential.T, b @ essential
-    slopes = np.square(lines_one[:, :2]).sum(1) + np.square(lines_two[:, :2]).sum(1)
+    slopes = np.square(lines_one[:, :axes]).sum(1) + np.square(lines_two[:, :axes]).sum(1)
     distance = np.abs((b * lines_two).sum(1)) / np.sqrt(np.maximum(slopes, 1e-24))
     focal = min(camera.mean_focal_length() for camera in cameras)
     return float((distance * focal <= CONFIRMED * _tolerance(max(max(c.width, c.height) for c in cameras))).mean())
@@ -244,18 +237,21 @@ def _tolerance(largest: int) -> float:
     return max(VERIFIED * largest, 1.0)
 
 
-def _reconstruct(folder: Path, database: Path, job: dict[str, Any]) -> tuple[pycolmap.Reconstruction | None, list[int]]:
+def _reconstruct(
+    folder: Path, database: Path, job: dict[str, Any], lens: AssumedLens
+) -> tuple[pycolmap.Reconstruction | None, list[int]]:
     """Place the views all at once, and one after another where that leaves out some that match others.
 
-    Focal lengths are estimated from pairs of views first: with COLMAP's assumption alone, rigs of few views end in a
-    wrong one.
+    Focal lengths of pinholes are estimated from pairs of views first: with COLMAP's assumption alone, rigs of few views
+    end in a wrong one.
 
     Returns:
         The better model, and the views that another one has and it has not, by their numbers.
     """
     output = folder / "models"
     output.mkdir(exist_ok=True)
-    pycolmap.calibrate_view_graph(database)
+    if not lens.is_fisheye:
+        pycolmap.calibrate_view_graph(database)
     total, models = _matching_views(database), []
     for number, mapper in enumerate((_map_globally, _map_incrementally)):
         _say("placing cameras", number, 2)
@@ -300,106 +296,13 @@ def _mean_error(model: pycolmap.Reconstruction) -> float:
     return float(model.compute_mean_reprojection_error())
 
 
-def _with_best_cameras(model: pycolmap.Reconstruction, lenses: list[list[int]]) -> pycolmap.Reconstruction:
-    """Return the model adjusted with the cameras that its points speak for: how many parameters, shared or not.
-
-    If there are many more than COMPARED observations, some of the points choose the cameras, and then all count.
-
-    Args:
-        model: as it was placed.
-        lenses: the number of each view's lens, in each way that is tried, from the fewest lenses on.
-    """
-    best, chosen, least = model, (FIRST_MODEL, lenses[0]), np.inf
-    every = max(1, round(model.compute_num_observations() / COMPARED))
-    _say("adjusting lenses", 0, 1)
-    for some in lenses:
-        for name in MODELS:
-            tried = _with_cameras(model, name, some, every)
-            _adjust(tried)
-            measure = _criterion(tried)
-            if measure < least:
-                best, chosen, least = tried, (name, some), measure
-            elif name != MODELS[0]:
-                break  # more parameters do not help
-    if every == 1 or not np.isfinite(least):
-        return best
-    whole = _with_cameras(model, *chosen)
-    for number, camera in best.cameras.items():
-        whole.cameras[number].params = camera.params
-    _adjust(whole)
-    return whole
-
-
-def _adjust(model: pycolmap.Reconstruction) -> None:
-    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    options.ceres.solver_options.function_tolerance = TOLERANCE
-    pycolmap.bundle_adjustment(model, options)
-
-
-def _criterion(model: pycolmap.Reconstruction) -> float:
-    """Return n log(mean squared error) + EVIDENCE k log(n) of n coordinates and k parameters of cameras."""
-    if any(camera.has_bogus_params(0.1, 10.0, 1.0) for camera in model.cameras.values()):
-        return np.inf
-    errors = _errors(model)
-    parameters = sum(len(camera.params) - 2 for camera in model.cameras.values())  # but the principal point
-    count = 2 * len(errors)
-    return float(count * np.log((errors**2).mean()) + EVIDENCE * parameters * np.log(count))
-
-
-def _with_cameras(
-    model: pycolmap.Reconstruction, name: str, lenses: list[int], every: int = 1
-) -> pycolmap.Reconstruction:
-    """Return a copy with other camera models, which begin with the focal length found and without distortion.
-
-    Args:
-        model: what is copied.
-        name: of the camera model.
-        lenses: the number of each view's lens.
-        every: the copy has one of so many points.
-    """
-    copy = pycolmap.Reconstruction()
-    cameras: set[int] = set()
-    for number in model.reg_image_ids():
-        image = model.images[number]
-        key = lenses[number - 1] + 1
-        if key not in cameras:
-            own = model.cameras[image.camera_id]
-            camera = pycolmap.Camera.create_from_model_name(key, name, own.mean_focal_length(), own.width, own.height)
-            copy.add_camera_with_trivial_rig(camera)
-            cameras.add(key)
-        places = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-        copied = pycolmap.Image(name=image.name, keypoints=places, camera_id=key, image_id=number)
-        copy.add_image_with_trivial_frame(copied, image.cam_from_world())
-    for point in islice(model.points3D.values(), 0, None, every):
-        copy.add_point3D(point.xyz, point.track)
-    return copy
-
-
-def _errors(model: pycolmap.Reconstruction) -> np.ndarray:
-    """Return the distance in pixels of each observation from its projected point."""
-    return np.array(
-        [
-            np.hypot(*(observed - projected))
-            for number in model.reg_image_ids()
-            for observed, projected in _projections(model, model.images[number])
-        ]
-    )
-
-
-def _projections(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    for point in image.get_observation_points2D():
-        projected = image.project_point(model.points3D[point.point3D_id].xyz)
-        if projected is not None:
-            yield point.xy, projected
-
-
 def _views(model: pycolmap.Reconstruction) -> dict[str, Any]:
     """Describe the placed views by their numbers."""
     found = {}
     for number in model.reg_image_ids():
         image = model.images[number]
         camera = model.cameras[image.camera_id]
-        errors = [float(np.hypot(*(seen - projected))) for seen, projected in _projections(model, image)]
+        errors = [float(np.hypot(*(seen - projected))) for seen, projected in projections(model, image)]
         found[str(number - 1)] = {
             "camera_from_world": image.cam_from_world().matrix().tolist(),
             "model": camera.model_name,

@@ -100,12 +100,12 @@ def _relative(file: Path, root: Path) -> str:
 
 def _camera(found: Found, number: int) -> dict[str, Any]:
     view: PlacedView = found.structure.views[number]
-    lens = dict(
-        zip(("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"), (*view.intrinsics, *view.distortion), strict=True)
-    )
+    last = ("k3", "k4") if view.is_fisheye else ("p1", "p2")
+    names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", *last)
+    lens = dict(zip(names, (*view.intrinsics, *view.distortion), strict=True))
     # Photographs show a surrounding without bounds, which near and far would cut off at the points that were found.
     depths = None if found.kind == "photographs" else depth_range(found.structure, number, view)
     near_far = {} if depths is None else {"near": depths[0], "far": depths[1]}
-    return {name: float(value) for name, value in (lens | near_far).items()} | {
-        "transform_matrix": np.round(view.camera_to_world, 9).tolist()
-    }
+    model = {"camera_model": "OPENCV_FISHEYE"} if view.is_fisheye else {}
+    numbers = {name: float(value) for name, value in (lens | near_far).items()}
+    return model | numbers | {"transform_matrix": np.round(view.camera_to_world, 9).tolist()}

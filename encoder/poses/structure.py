@@ -19,6 +19,7 @@ from kpc.encoder.poses.orientation import looked_at
 from kpc.format.common import extras
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.progress import Progress
+from kpc.format.scene.camera_models import FISHEYE_MODELS
 
 # The larger side of pictures in which features are looked for, pixels; more are averaged down.
 LARGEST_SIDE = 1600
@@ -61,9 +62,10 @@ class PlacedView:
     Attributes:
         camera_to_world: (4, 4) float64, OpenGL convention.
         intrinsics: fl_x fl_y cx cy in pixels of the picture.
-        distortion: k1 k2 p1 p2 of OpenCV's lens model.
+        distortion: k1 k2 p1 p2 of OpenCV's lens model, or k1 k2 k3 k4 of its fisheye model.
         points: number of points that it sees.
         error: mean distance in pixels between projected points and where they were found.
+        is_fisheye: whether the lens model is the fisheye model.
     """
 
     camera_to_world: np.ndarray
@@ -71,6 +73,7 @@ class PlacedView:
     distortion: tuple[float, float, float, float]
     points: int
     error: float
+    is_fisheye: bool = False
 
 
 class Pair(NamedTuple):
@@ -275,13 +278,15 @@ def _read(folder: Path) -> Structure:
     views = {}
     for number, view in found["views"].items():
         camera_from_world = np.array(view["camera_from_world"])  # (3, 4)
-        lens = view["parameters"]
+        lens, is_fisheye = view["parameters"], view["model"] in FISHEYE_MODELS
+        last = ("k3", "k4") if is_fisheye else ("p1", "p2")
         views[int(number)] = PlacedView(
             opengl_pose(camera_from_world[:, :3], camera_from_world[:, 3]),
             (lens.get("fx", lens.get("f")), lens.get("fy", lens.get("f")), lens["cx"], lens["cy"]),
-            (lens.get("k1", lens.get("k", 0.0)), lens.get("k2", 0.0), lens.get("p1", 0.0), lens.get("p2", 0.0)),
+            (lens.get("k1", lens.get("k", 0.0)), lens.get("k2", 0.0), *(lens.get(name, 0.0) for name in last)),
             view["points"],
             float("nan") if view["error"] is None else view["error"],  # of a view without points
+            is_fisheye,
         )
     empty = np.zeros((0, 3))
     return Structure(

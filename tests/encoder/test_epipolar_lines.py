@@ -31,8 +31,10 @@ def distance(check) -> float:
     return float(np.linalg.norm(a + share[:, None] * (b - a) - p, axis=1).min())
 
 
-def test_what_is_seen_at_a_place_lies_where_it_looks():
-    view = model().views[0]
+@pytest.mark.parametrize("is_fisheye", [False, True])
+def test_what_is_seen_at_a_place_lies_where_it_looks(is_fisheye):
+    lens, distortion = ((90.0, 91.0, 128.0, 96.0), (0.03, -0.004, 0.001, 0.0002)) if is_fisheye else (LENS, BARREL)
+    view = PlacedView(model().views[0].camera_to_world, lens, distortion, 40, 0.1, is_fisheye)
     places = np.random.default_rng(1).uniform((10, 10), (240, 180), (20, 2))
     ahead = view.camera_to_world[:3, 3] + 3.0 * looks(view, *places.T)
     assert seen_at(view, ahead) == pytest.approx(places, abs=1e-6)

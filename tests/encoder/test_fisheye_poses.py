@@ -1,0 +1,64 @@
+"""Cameras with fisheye lenses are placed from their pictures alone; what is found of the lens is read back."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from textured_room import aligned, rig, write_pictures
+
+pytest.importorskip("pycolmap", reason="needs pycolmap, of the extra poses")
+pytest.importorskip("scipy", reason="needs scipy, of the extra poses")
+
+from kpc.encoder.cli import kpposes
+from kpc.encoder.datasets import load_dataset
+from kpc.encoder.datasets.rays import pixel_rays
+
+FOCAL = 120.0  # 122 degrees across, 153 degrees from corner to corner
+CAMERAS = [replace(camera, focal=FOCAL, is_fisheye=True) for camera in rig(5)]
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of pictures, and nothing else."""
+    folder = tmp_path_factory.mktemp("fisheye") / "pictures"
+    write_pictures(folder, CAMERAS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def file(pictures: Path) -> Path:
+    """What `kpposes` writes about it."""
+    file = pictures / "transforms.json"
+    assert kpposes.main([str(pictures), "-o", str(file)]) == 0
+    return file
+
+
+def test_all_are_placed_and_their_lens_is_found(file):
+    frames = json.loads(file.read_text())["frames"]
+    poses = np.array([frame["transform_matrix"] for frame in frames])
+    centres, angle = aligned(poses, np.stack([camera.pose for camera in CAMERAS]))
+    assert centres < 0.005 and angle < 0.2
+    assert {frame["camera_model"] for frame in frames} == {"OPENCV_FISHEYE"}
+    assert frames[0]["fl_x"] == pytest.approx(FOCAL, rel=0.01)
+
+
+def test_rays_of_the_dataset_are_those_of_the_lens(file, tmp_path):
+    dataset = load_dataset(file.parent, cache_dir=tmp_path)
+    shown = dataset.pictures
+    assert shown.is_fisheye.all()
+    row, column = (axis.ravel() for axis in np.mgrid[: shown.height[0] : 16, : shown.width[0] : 16])
+    _, found = pixel_rays(shown, np.zeros(len(row), int), column, row)
+    right, up = (column + 0.5 - 128) / FOCAL, -(row + 0.5 - 96) / FOCAL
+    angle = np.hypot(right, up)
+    share = np.sinc(angle / np.pi)
+    true = np.stack([right * share, up * share, -np.cos(angle)], axis=1) @ shown.camera_to_world[0][:3, :3].T
+    assert np.degrees(np.arccos(np.clip((found * true).sum(1), -1, 1))).max() < 0.5
+
+
+def test_the_page_shows_epipolar_lines_of_such_lenses(file):
+    page = (file.parent / "cameras.html").read_text()
+    assert page.count("<img") == len(CAMERAS)
+    assert page.count('<polyline class="check"') == page.count('<circle class="check"') > 0
