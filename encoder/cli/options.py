@@ -255,7 +255,7 @@ def _add_dataset_options(parser: argparse.ArgumentParser) -> None:
         help="average blocks of N x N pixels first; auto: so that pictures have no more than "
         f"{PIXELS_PER_TEXEL} pixels for a texel of the preset's finest planes (default: %(default)s)",
     )
-    parser.add_argument("--holdout", metavar="NAME", help="camera or file to test on, or 'none'")
+    parser.add_argument("--holdout", metavar="NAME", help="camera, file or folder of images to test on, or 'none'")
     parser.add_argument(
         "--space",
         choices=("auto", "box", "contracted", "ndc"),

@@ -288,11 +288,12 @@ def holdout_flags(path: Path, names: Sequence[str], holdout: str | None, default
     Args:
         path: the dataset's folder, for messages.
         names: of the files, relative to it.
-        holdout: a file's name with or without folder and suffix, "none", or None for the layout's default.
+        holdout: a file's name with or without folder and suffix, or that of a folder; "none", or None for the layout's
+            default.
         default: the layout's default for each file.
 
     Raises:
-        DatasetError: no file has the name `holdout`.
+        DatasetError: no file or folder has the name `holdout`.
     """
     if holdout is None:
         return list(default)
@@ -300,10 +301,11 @@ def holdout_flags(path: Path, names: Sequence[str], holdout: str | None, default
         return [False] * len(names)
     chosen = [holdout in (name, Path(name).name, Path(name).stem) for name in names]
     if not any(chosen):
-        shown = ", ".join(Path(name).stem for name in names[:4])
-        raise DatasetError(
-            f"{path}: no file is named {holdout!r}; give --holdout one of {shown}{' ...' if len(names) > 4 else ''}"
-        )
+        folders = [[str(folder) for folder in Path(name).parents[:-1]] for name in names]
+        chosen = [holdout in (*own, *(Path(folder).name for folder in own)) for own in folders]
+    if not any(chosen):
+        shown = ", ".join(Path(name).stem for name in names[:4]) + (" ..." if len(names) > 4 else "")
+        raise DatasetError(f"{path}: no file or folder is named {holdout!r}; give --holdout one of {shown}")
     return chosen
 
 

@@ -113,6 +113,8 @@ def test_a_dataset_of_images_with_the_sound_of_the_videos_is_read_back(walks, fi
     assert dataset.poses_found and not dataset.is_monocular
     assert dataset.pictures.is_test.tolist() == [number % 8 == 0 for number in range(24)]
     assert [dataset.camera_names[c] for c in dataset.pictures.camera[[0, 23]]] == ["left/000002", "right/000011"]
+    other = load_dataset(file.parent, tmp_path, progress=False, transforms=file, footage=walks, holdout="right")
+    assert other.pictures.is_test.tolist() == [name == "right" for name, *_ in frames_of(file)]
     expected = HEARD[round(START_S * SAMPLE_RATE) :]
     for name in FOCALS:
         sound, found = find_sound(Options(Path("in"), Path("out.kpc"), audio=name), dataset)

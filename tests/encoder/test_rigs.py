@@ -53,7 +53,7 @@ def test_times_names_and_held_out_cameras(tmp_path: Path) -> None:
     assert "6 pictures of 40x30, 2 of them held out (00), dynamic, 2 frames" in dataset.describe()
     assert load(tmp_path / "set", holdout="010").pictures.is_test.tolist() == [False] * 4 + [True] * 2
     assert not load(tmp_path / "set", holdout="none").pictures.is_test.any()
-    fails(tmp_path / "set", "no file is named 'x'", holdout="x")
+    fails(tmp_path / "set", "no file or folder is named 'x'", holdout="x")
     rigs.write_nerfies(tmp_path / "nerfies")
     p = load(tmp_path / "nerfies").pictures
     assert p.time.tolist() == [0, 0.5, 1] and p.is_test.tolist() == [False, False, True]
