@@ -168,6 +168,9 @@ scenario('knows the viewpoints of the desktop player', async () => {
     }
     it.camera = 'opening';
     const expected = ['1 -3 1 0 0 0 50', it.camera];
+    it.setAttribute('camera', expected[0]);
+    it.removeAttribute('camera');
+    if (it.camera !== expected[1]) throw new Error(`without a camera: ${it.camera}`);
     if (seen.some((view, i) => view !== expected[i % 2])) throw new Error(seen.join('; '));
     for (const name of ['opening', ...it.presets, ...it.cameras]) {
       it.camera = name;
@@ -389,8 +392,18 @@ scenario('heeds the keys of the desktop player', async () => {
   assert.equal(cameras[0], cameras[1]);
   await press('h');
   assert.equal(await inside(page, '.panel.keys').isVisible(), true);
+  await press('End'); // scrolls the list
+  assert.equal(await player(page, (it) => it.ended), false);
   await press('Escape');
   assert.equal(await inside(page, '.panel.keys').isVisible(), false);
+  // Panels close if something else gets the focus, but not for what is in the player.
+  await button(page, 'Settings').click();
+  const panel = inside(page, '.panel:not([hidden])');
+  await panel.locator('select').first().focus();
+  assert.equal(await panel.count(), 1);
+  await page.evaluate(() => document.body.append(Object.assign(document.createElement('button'), { id: 'outside' })));
+  await page.locator('#outside').focus();
+  assert.equal(await panel.count(), 0);
   // Open settings show what keys and scripts change, and a click sets what it shows.
   await player(page, (it) => {
     it.playbackRate = 1.5;

@@ -45,6 +45,17 @@ test('camera-controls is off by its word as a property, too', () => {
   assert.equal(player.cameraControls, false);
 });
 
+test('an unknown word counts as the first known one, and is warned of once', (context) => {
+  const player = new Player();
+  const warn = context.mock.method(console, 'warn', () => {});
+  player.quality = 'high';
+  assert.deepEqual([player.quality, player.quality], ['auto', 'auto']);
+  player.quality = 'Fine';
+  assert.equal(player.quality, 'fine');
+  const said = warn.mock.calls.map(({ arguments: [message] }) => String(message).slice(0, 58));
+  assert.deepEqual(said, ['kpc-player: quality="high" is not known; use auto, fastest']);
+});
+
 test('booleans are true or false whatever is set', () => {
   for (const name of ['controls', 'autoplay', 'loop', 'playsInline', 'muted', 'cameraControls'] as const) {
     const player = new Player();

@@ -3,10 +3,22 @@
 export const string = (element: HTMLElement, name: string, missing = ''): string =>
   element.getAttribute(name) ?? missing;
 
-/** Return the value of an attribute if it is one of some words, else the first of them. */
+/** Values of attributes that have been warned of, by elements. */
+const warned = new WeakMap<HTMLElement, Set<string>>();
+
+/** Return the value of an attribute if it is one of some words, else the first of them, with a warning. */
 export function word<T extends string>(element: HTMLElement, name: string, words: readonly T[]): T {
   const value = element.getAttribute(name)?.toLowerCase();
-  return words.find((known) => known === value) ?? words[0];
+  const found = words.find((known) => known === value);
+  if (found === undefined && value) warnOnce(element, `${name}="${value}" is not known; use ${words.join(', ')}`);
+  return found ?? words[0];
+}
+
+function warnOnce(element: HTMLElement, message: string): void {
+  const known = warned.get(element) ?? new Set();
+  warned.set(element, known);
+  if (!known.has(message)) console.warn(`kpc-player: ${message}`);
+  known.add(message);
 }
 
 /** Return a positive number; what is missing or no such number counts as `missing`. */

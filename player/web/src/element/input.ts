@@ -39,6 +39,9 @@ interface Pointer {
   at: number;
 }
 
+/** Keys that scroll a list that has the focus. */
+const SCROLLING = ['Home', 'End', 'PageUp', 'PageDown', 'ArrowUp', 'ArrowDown', ' '];
+
 export class Input {
   readonly #stage: HTMLElement;
   readonly #options: InputOptions;
@@ -150,6 +153,7 @@ export class Input {
     const target = event.composedPath()[0];
     if (event.ctrlKey || event.altKey || event.metaKey || event.defaultPrevented || !this.#options.hearsKeys()) return;
     if (target instanceof HTMLSelectElement || (target instanceof HTMLInputElement && target.type === 'text')) return;
+    if (target instanceof HTMLElement && target.classList.contains('keys') && SCROLLING.includes(event.key)) return;
     // Space presses buttons and switches; on the timeline, where it does nothing else, it plays or pauses.
     const isPressed =
       target instanceof HTMLInputElement ? target.type !== 'range' : target instanceof HTMLButtonElement;

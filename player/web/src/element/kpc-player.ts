@@ -106,7 +106,7 @@ export class KpcPlayer extends AudibleElement implements Model {
     if (name === 'src') this.#begin();
     if (name === 'poster') this.#ui.setPoster(this.poster);
     if (name === 'loop') this.#clock.loop = this.loop;
-    if (name === 'camera' && value !== null) this.camera = value;
+    if (name === 'camera' && (value !== null || this.#session?.view)) this.camera = value ?? 'opening';
     if (name === 'target-fps' && this.#session) this.#session.fps = this.targetFps || undefined;
     if (name === 'muted' && connected.has(this)) this.loudnessChanged();
     if (name === 'preload' && connected.has(this)) {

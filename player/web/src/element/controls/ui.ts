@@ -137,6 +137,10 @@ export class Ui {
       (event) => event.key === 'Escape' && this.closePanels() && event.preventDefault(),
     );
     this.stage.addEventListener('pointerdown', () => this.closePanels());
+    this.player.addEventListener('focusout', ({ relatedTarget }) => {
+      // A list of choices that the system shows takes the focus, too, and names nothing that has it now.
+      if (relatedTarget !== null && !this.player.contains(relatedTarget as Node)) this.closePanels();
+    });
   }
 
   setPoster(src: string): void {
