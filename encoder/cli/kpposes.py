@@ -17,7 +17,7 @@ from kpc.encoder.datasets.layouts.nerfstudio import NAME as NERFSTUDIO
 from kpc.encoder.datasets.loading import layouts_of
 from kpc.encoder.evaluation.camera_page import check_page
 from kpc.encoder.poses.document import write_document
-from kpc.encoder.poses.facts import camera_table
+from kpc.encoder.poses.facts import camera_table, lens_text
 from kpc.encoder.poses.find import Found, find_poses
 from kpc.encoder.poses.page import NAME, write_page
 from kpc.encoder.poses.wishes import add_pose_options, wishes_from
@@ -100,9 +100,11 @@ def _say_if_not_read(folder: Path, file: Path) -> None:
 def report(found: Found) -> str:
     """Return a table of the cameras, with clock, points and error, or a line about their pictures, as text."""
     if found.kind in ("moving camera", "photographs"):
-        views = found.structure.views.values()
-        points = sorted(view.points for view in views)
-        return f"{len(views)} pictures, error {found.structure.error:.2f} px, {points[len(points) // 2]} points in each"
+        views = list(found.structure.views.values())
+        points = sorted(view.points for view in views)[len(views) // 2]
+        lenses = list(dict.fromkeys(map(lens_text, views)))
+        focal = f"focal length {lenses[0]}" if len(lenses) == 1 else f"{len(lenses)} lenses"
+        return f"{len(views)} pictures, error {found.structure.error:.2f} px, {points} points in each, {focal}"
     rows = [(escaped(name), *facts) for name, *facts in camera_table(found)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(

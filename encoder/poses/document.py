@@ -10,7 +10,7 @@ from kpc.encoder.datasets.layouts.nerfstudio import IMAGES, MADE_BY
 from kpc.encoder.datasets.video import read_video
 from kpc.encoder.poses.clocks import Clock
 from kpc.encoder.poses.find import Found, depth_range
-from kpc.encoder.poses.footage import Footage
+from kpc.encoder.poses.footage import Footage, frame_size
 from kpc.encoder.poses.instants import frame_times
 from kpc.encoder.poses.structure import PlacedView
 from kpc.encoder.poses.takes import Take
@@ -27,7 +27,9 @@ def write_document(found: Found, root: Path, file: Path) -> None:
         root: the folder that names are relative to, but for the frames of the videos of moving cameras.
         file: of the document.
     """
-    document: dict[str, Any] = {"camera_model": "OPENCV", "made_by": MADE_BY, "kind": found.kind}
+    # Other readers look at the document's model alone.
+    model = "OPENCV_FISHEYE" if all(view.is_fisheye for view in found.structure.views.values()) else "OPENCV"
+    document: dict[str, Any] = {"camera_model": model, "made_by": MADE_BY, "kind": found.kind}
     if found.is_metric:
         document["unit"] = "metre"
     if found.take is not None:
@@ -43,15 +45,14 @@ def write_document(found: Found, root: Path, file: Path) -> None:
 def _frames_of(found: Found, number: int, root: Path) -> list[dict[str, Any]]:
     """Return the frames of a camera that stands still: its video, or each of its images."""
     footage, clock = found.footage[number], found.clocks[number]
-    camera = _camera(found, number)
+    camera = _camera(found, number, footage)
     if footage.video is None:
         times = frame_times(footage) / max(len(footage.files) - 1, 1)
         return [
             {"file_path": _relative(image, root)} | ({"time": float(time)} if len(footage.files) > 1 else {}) | camera
             for image, time in zip(footage.files, times, strict=True)
         ]
-    size = {"w": footage.video.width, "h": footage.video.height}
-    return [{"file_path": _relative(footage.files[0], root)} | _clock(clock) | size | camera]
+    return [{"file_path": _relative(footage.files[0], root)} | _clock(clock) | camera]
 
 
 def _clock(clock: Clock) -> dict[str, float]:
@@ -75,7 +76,7 @@ def _moving_cameras(found: Found, take: Take, root: Path, folder: Path) -> dict[
             names = {frame: f"{IMAGES}/{name}.png" for frame, name in zip(track.frames, track.frame_names, strict=True)}
             files = {frame: names[frame] for frame in placed}
             _write_frames(footage, track.frames, {frame: folder / file for frame, file in files.items()})
-        cameras = {view: _camera(found, view) for view in track.views if view in found.structure.views}
+        cameras = {view: _camera(found, view, footage) for view in track.views if view in found.structure.views}
         document["frames"] += [
             {"file_path": files[frame], "time": float(time)} | cameras[track.view_of(frame)]
             for frame, time in zip(track.frames, track.times, strict=True)
@@ -98,7 +99,7 @@ def _relative(file: Path, root: Path) -> str:
     return file.relative_to(root).as_posix()
 
 
-def _camera(found: Found, number: int) -> dict[str, Any]:
+def _camera(found: Found, number: int, footage: Footage) -> dict[str, Any]:
     view: PlacedView = found.structure.views[number]
     last = ("k3", "k4") if view.is_fisheye else ("p1", "p2")
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", *last)
@@ -107,5 +108,7 @@ def _camera(found: Found, number: int) -> dict[str, Any]:
     depths = None if found.kind == "photographs" else depth_range(found.structure, number, view)
     near_far = {} if depths is None else {"near": depths[0], "far": depths[1]}
     model = {"camera_model": "OPENCV_FISHEYE"} if view.is_fisheye else {}
-    numbers = {name: float(value) for name, value in (lens | near_far).items()}
+    numbers = dict(zip("wh", frame_size(footage), strict=True)) | {
+        name: float(value) for name, value in (lens | near_far).items()
+    }
     return model | numbers | {"transform_matrix": np.round(view.camera_to_world, 9).tolist()}

@@ -10,7 +10,7 @@ from kpc.encoder.poses.find import Found
 from kpc.encoder.poses.structure import PlacedView
 
 # Headings of the facts about a clock, and about a view.
-CLOCK, VIEW = ("clock s", "rate", "by", "confidence"), ("focal px", "points", "error px")
+CLOCK, VIEW = ("clock s", "rate", "by", "confidence"), ("focal length", "points", "error px")
 
 
 def clock_facts(clock: Clock) -> tuple[str, ...]:
@@ -28,7 +28,12 @@ def view_facts(views: Sequence[PlacedView]) -> tuple[str, ...]:
     if not views:
         return ("not placed", "", "")
     points = sorted(view.points for view in views)[len(views) // 2]
-    return f"{views[0].intrinsics[0]:.1f}", f"{points}", f"{np.mean([view.error for view in views]):.2f}"
+    return lens_text(views[0]), f"{points}", f"{np.mean([view.error for view in views]):.2f}"
+
+
+def lens_text(view: PlacedView) -> str:
+    """Return the focal length, and whether the lens is a fisheye."""
+    return f"{view.intrinsics[0]:.1f} px" + (", fisheye" if view.is_fisheye else "")
 
 
 def camera_table(found: Found) -> list[tuple[str, ...]]:

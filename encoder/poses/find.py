@@ -45,6 +45,8 @@ LONG, FEATURES_OF_LONG = 200, 1024
 PHOTOGRAPHS = Pairing((1, 2), alike=20)
 # What to do where clocks are unknown.
 CLAP = "film a clap that all cameras see and hear, or give their offsets with --sync offsets.json"
+# Where gravity and the horizons of the cameras differ by more, that is said.
+CONTRADICTING_DEGREES = 60.0
 # A scene cannot be made from fewer cameras.
 LEAST_CAMERAS = 3
 
@@ -391,13 +393,17 @@ def _up(root: Path, found: Found) -> np.ndarray:
         if number in files and (up := tagged_up(files[number])) is not None
     ]
     agreed = agreed_up(np.array(votes).reshape(-1, 3))
-    if agreed is not None:
-        notice(f"{root}: up follows gravity: {agreed.agreeing} of {counted(len(votes), 'gravity tag')} agree")
-        return agreed.up
+    by_horizons = up_direction(np.stack([view.camera_to_world for view in views.values()]))
     tags = counted(len(votes), "gravity tag")
+    if agreed is not None:
+        angle = np.degrees(np.arccos(np.clip(agreed.up @ by_horizons, -1, 1)))
+        against = f"; the horizons of the cameras differ by {angle:.0f} degrees"
+        said = f"{agreed.agreeing} of {tags} agree{against if angle > CONTRADICTING_DEGREES else ''}"
+        notice(f"{root}: up follows gravity: {said}")
+        return agreed.up
     why = f"{tags} disagree" if len(votes) >= LEAST_TAGS else f"only {tags}" if votes else "no gravity tags"
-    notice(f"{root}: up follows from how the cameras are held ({why})")
-    return up_direction(np.stack([view.camera_to_world for view in views.values()]))
+    notice(f"{root}: up follows from the horizons of the cameras" + (f" ({why})" if files else ""))
+    return by_horizons
 
 
 def _images(found: Found) -> dict[int, Path]:

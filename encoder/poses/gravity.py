@@ -22,6 +22,7 @@ ANGLES = (
     (b"drone-dji:GimbalPitchDegree", b"drone-dji:GimbalRollDegree"),
     (b"GPano:PosePitchDegrees", b"GPano:PoseRollDegrees"),
 )
+VALUE = rb"""\s*(?:=\s*["']|>)\s*([+-]?\d{1,3}(?:\.\d{0,12})?)\s*["'<]"""
 # Tags agree if at least so many, and this share of them, are within so many degrees of their median.
 LEAST_TAGS, AGREEING, WITHIN_DEGREES = 3, 2 / 3, 10.0
 
@@ -110,7 +111,7 @@ def _up_of_phone(acceleration: np.ndarray, orientation: int) -> np.ndarray:
 def _angles(xmp: bytes) -> tuple[float, float] | None:
     """Return pitch and roll in degrees, whether they are attributes or elements of XMP; None without both."""
     for names in ANGLES:
-        found = [re.search(name + rb"""(?:="|='|>)([+-]?\d{1,3}(?:\.\d{0,12})?)["'<]""", xmp) for name in names]
+        found = [re.search(name + VALUE, xmp) for name in names]
         pitch, roll = (180.1 if one is None else float(one[1]) for one in found)
         if max(abs(pitch), abs(roll)) <= 180:
             return pitch, roll

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from textured_room import aligned, rig, write_pictures
+from textured_room import aligned, pose_at, rig, write_pictures, write_walk
 
 pytest.importorskip("pycolmap", reason="needs pycolmap, of the extra poses")
 pytest.importorskip("scipy", reason="needs scipy, of the extra poses")
@@ -43,6 +43,24 @@ def test_all_are_placed_and_their_lens_is_found(file):
     assert centres < 0.005 and angle < 0.2
     assert {frame["camera_model"] for frame in frames} == {"OPENCV_FISHEYE"}
     assert frames[0]["fl_x"] == pytest.approx(FOCAL, rel=0.01)
+
+
+def test_other_readers_see_the_model_and_the_size(file):
+    document = json.loads(file.read_text())
+    assert document["camera_model"] == "OPENCV_FISHEYE"
+    assert {(frame["w"], frame["h"]) for frame in document["frames"]} == {(256, 192)}
+
+
+def test_the_lens_of_a_carried_camera_is_found(tmp_path, capsys):
+    places = [replace(CAMERAS[0], pose=pose_at(angle, 1.2 + 0.01 * angle)) for angle in np.linspace(-25, 25, 16)]
+    write_walk(tmp_path / "walk" / "walk.mp4", places, 10.0)
+    assert kpposes.main([str(tmp_path / "walk"), "-o", str(tmp_path / "walk.json"), "--rig", "moving"]) == 0
+    said = capsys.readouterr().out
+    assert "16 pictures" in said and "px, fisheye" in said
+    frames = json.loads((tmp_path / "walk.json").read_text())["frames"]
+    assert frames[0]["fl_x"] == pytest.approx(FOCAL, rel=0.03)
+    centres, angle = aligned(np.array([f["transform_matrix"] for f in frames]), np.stack([one.pose for one in places]))
+    assert centres < 0.01 and angle < 0.5
 
 
 def test_rays_of_the_dataset_are_those_of_the_lens(file, tmp_path):

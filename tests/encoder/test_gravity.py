@@ -221,14 +221,19 @@ def test_gravity_turns_leaning_cameras_upright() -> None:
     "pitches, said, lean",
     [
         (["-50"] * 6, "up follows gravity: 6 of 6 gravity tags agree", 0),
+        (
+            ["80"] * 6,
+            "up follows gravity: 6 of 6 gravity tags agree; the horizons of the cameras differ by 80 degrees",
+            130,
+        ),
         (["-50", "-49", "-51", "-50", "20", None], "up follows gravity: 4 of 5 gravity tags agree", 0),
-        (["-50", None, None, None, None, None], "up follows from how the cameras are held (only 1 gravity tag)", 50),
+        (["-50", None, None, None, None, None], "up follows from the horizons of the cameras (only 1 gravity tag)", 50),
         (
             ["-50", "0", "50", "-90", "90", "-20"],
-            "up follows from how the cameras are held (6 gravity tags disagree)",
+            "up follows from the horizons of the cameras (6 gravity tags disagree)",
             50,
         ),
-        ([None] * 6, "up follows from how the cameras are held (no gravity tags)", 50),
+        ([None] * 6, "up follows from the horizons of the cameras (no gravity tags)", 50),
     ],
 )
 def test_found_cameras_stand_upright(tmp_path, capsys, monkeypatch, rig, pitches, said, lean) -> None:
