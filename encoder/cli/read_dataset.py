@@ -135,6 +135,7 @@ def _asked(options: Options) -> dict[str, Any]:
         "--rig": wishes.rig,
         "--sync": [str(wishes.sync), given],
         "--distance": wishes.distance and list(wishes.distance),
+        "--lens": wishes.lens,
         "the footage": [[str(file), file.stat().st_size, file.stat().st_mtime] for file in files],
     }
 

@@ -47,7 +47,7 @@ def main(folder: Path) -> None:
     database = folder / "views.db"
     keypoints = _of_views(job, [places for places, _ in pictures])
     sizes = [job["cameras"][view["camera"]]["size"] for view in job["views"]]
-    lens = assumed_lens(keypoints, sizes, matches, _tolerance(max(map(max, sizes))))
+    lens = assumed_lens(keypoints, sizes, matches, _tolerance(max(map(max, sizes))), job["kind"])
     _write_views(database, job, keypoints, matches, lens)
     _verify(database, job)
     model, apart = _reconstruct(folder, database, job, lens)
@@ -55,7 +55,7 @@ def main(folder: Path) -> None:
     arrays: dict[str, Any] = {}
     if model is not None:
         _say("adjusting lenses", 0, 1)
-        model = with_best_cameras(model, job["lenses"])
+        model = with_best_cameras(model, job["lenses"], job["kind"])
         found["views"], arrays = _views(model), _points(model)
     found["pairs"] = _pairs(database, model)
     np.savez(folder / "result.npz", **arrays)

@@ -96,7 +96,7 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
     if max(counts) == 1:
         frames = "; --rig moving for the frames of a clip" if _is_numbered(footage) else ""
         notice(f"{root}: taken for photographs of one scene ({counted(len(footage), 'image')}{frames})")
-        found = _find_photographs(root, footage)
+        found = _find_photographs(root, footage, wishes.lens)
     else:
         sync = read_clocks(wishes.sync, [one.name for one in footage]) if isinstance(wishes.sync, Path) else wishes.sync
         looked = [] if wishes.rig == "moving" else footage
@@ -104,7 +104,7 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
         is_still = all(seen.is_still for seen in surveys) if wishes.rig == "auto" else wishes.rig == "still"
         notice(f"{root}: {_what(footage, surveys, is_still, wishes.rig)}")
         if is_still:
-            found = _find_still_rig(root, footage, surveys, sync)
+            found = _find_still_rig(root, footage, surveys, sync, wishes.lens)
         else:
             found = _find_moving_cameras(root, footage, surveys, sync, wishes)
     _check(root, found, wishes.require_all)
@@ -156,7 +156,9 @@ def _check_view_names(root: Path, wishes: Wishes, names: Sequence[str]) -> None:
         raise DatasetError(f"{root}: --distance: {', '.join(unknown)} {is_or_are}; there are {first_names(names)}")
 
 
-def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Survey], sync: str | list[Clock]) -> Found:
+def _find_still_rig(
+    root: Path, footage: tuple[Footage, ...], surveys: list[Survey], sync: str | list[Clock], lens: str
+) -> Found:
     """Place cameras that stand still; their clocks are given, or found as --sync says."""
     if len(footage) < LEAST_CAMERAS:
         raise DatasetError(
@@ -169,7 +171,9 @@ def _find_still_rig(root: Path, footage: tuple[Footage, ...], surveys: list[Surv
 
     def place(pictures: Sequence[Picture], features: int) -> Structure:
         def without_false(pairing: Pairing) -> Structure:
-            return without_false_views(reconstruct(pictures, names, ways[0], features, pairing, ways), is_rig=True)
+            return without_false_views(
+                reconstruct(pictures, names, ways[0], features, pairing, ways, lens), is_rig=True
+            )
 
         return _undisturbed(without_false)
 
@@ -274,7 +278,7 @@ def _find_moving_cameras(
         footage: of each camera.
         surveys: of each, where some may stand still; else none.
         sync: one of `wishes.SYNC_MODES`, or the clocks.
-        wishes: for the names of views.
+        wishes: for the names of views, and the lens.
     """
     names, are_videos = [one.name for one in footage], footage[0].video is not None
     if single := next((one.files[0].name for one in footage if frame_count(one) == 1), None):
@@ -304,13 +308,14 @@ def _find_moving_cameras(
             features,
             pairing_of(take, known),
             ([by_size[camera] for camera in take.cameras], take.cameras) if len(footage) > 1 else (),
+            wishes.lens,
         )
     )
     kind = "moving cameras" if len(footage) > 1 else "moving camera"
     return Found(kind, footage, tuple(clocks), take.names, structure, False, take=take)
 
 
-def _find_photographs(root: Path, footage: tuple[Footage, ...]) -> Found:
+def _find_photographs(root: Path, footage: tuple[Footage, ...], lens: str) -> Found:
     def pictures() -> Iterator[Picture]:
         for number, one in enumerate(footage):
             yield Picture(number, 0, grey_of(read_image(one.files[0], upright=True)), None)
@@ -318,7 +323,7 @@ def _find_photographs(root: Path, footage: tuple[Footage, ...]) -> Found:
     sizes = [image_info(one.files[0]).displayed_size for one in footage]
     features = FEATURES_OF_MANY if len(footage) > MANY else ATTEMPTS[0][0]
     names = [one.name for one in footage]
-    structure = without_false_views(reconstruct(pictures(), names, _lenses(sizes), features, PHOTOGRAPHS))
+    structure = without_false_views(reconstruct(pictures(), names, _lenses(sizes), features, PHOTOGRAPHS, (), lens))
     clocks = (UNKNOWN,) * len(footage)
     return Found("photographs", footage, clocks, tuple(names), structure, False)
 

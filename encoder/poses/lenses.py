@@ -64,6 +64,7 @@ def assumed_lens(
     sizes: Sequence[tuple[int, int]],
     matches: Mapping[tuple[int, int], np.ndarray],
     tolerance: float,
+    kind: str,
 ) -> AssumedLens:
     """Return the lens with which most matches agree: a pinhole, or a fisheye lens if that is clearly better.
 
@@ -75,7 +76,10 @@ def assumed_lens(
         sizes: width and height of each view's pictures.
         matches: of pairs of views, (M, 2) numbers of keypoints.
         tolerance: pixels that a match may be off.
+        kind: one of `wishes.LENSES`: of what kind the lens is.
     """
+    if kind == "pinhole":
+        return PINHOLE
     options = pycolmap.RANSACOptions(max_error=tolerance, max_num_trials=PROBING_TRIALS, random_seed=0)
 
     def places(pair: tuple[int, int]) -> list[np.ndarray]:
@@ -107,7 +111,7 @@ def assumed_lens(
 
     counts = {lens: agreeing(lens) for lens in FISHEYE_LENSES}
     best = max(FISHEYE_LENSES, key=counts.__getitem__)
-    return best if counts[best] > CLEARLY * agreeing(PINHOLE) else PINHOLE
+    return best if kind == "fisheye" or counts[best] > CLEARLY * agreeing(PINHOLE) else PINHOLE
 
 
 def is_fisheye(camera: pycolmap.Camera) -> bool:
@@ -125,7 +129,7 @@ def rays(camera: pycolmap.Camera, places: np.ndarray) -> np.ndarray:
     return np.pad(camera.cam_from_img(places), ((0, 0), (0, 1)), constant_values=1.0)
 
 
-def with_best_cameras(model: pycolmap.Reconstruction, lenses: list[list[int]]) -> pycolmap.Reconstruction:
+def with_best_cameras(model: pycolmap.Reconstruction, lenses: list[list[int]], kind: str) -> pycolmap.Reconstruction:
     """Return the model adjusted with the cameras that its points speak for: how many parameters, shared or not.
 
     If there are many more than COMPARED observations, some of the points choose the cameras, and then all count.
@@ -133,10 +137,13 @@ def with_best_cameras(model: pycolmap.Reconstruction, lenses: list[list[int]]) -
     Args:
         model: as it was placed.
         lenses: the number of each view's lens, in each way that is tried, from the fewest lenses on.
+        kind: one of `wishes.LENSES`: of what kind they are.
     """
     best, chosen, least = model, ("", lenses[0]), np.inf
     every = max(1, round(model.compute_num_observations() / COMPARED))
-    families = (PINHOLES, FISHEYES) if _are_wide(model) else (PINHOLES,)
+    families = {"pinhole": (PINHOLES,), "fisheye": (FISHEYES,)}.get(kind, (PINHOLES, FISHEYES))
+    if kind == "auto" and not _are_wide(model):
+        families = (PINHOLES,)
     for some, family in product(lenses, families):
         for name in family:
             tried = _with_cameras(model, name, some, every)

@@ -123,6 +123,7 @@ def reconstruct(
     features: int,
     pairing: Pairing = ALL,
     lenses: Sequence[Sequence[int]] = (),
+    kind: str = "auto",
 ) -> Structure:
     """Find cameras and points.
 
@@ -134,6 +135,7 @@ def reconstruct(
         pairing: which pictures are matched.
         lenses: numbers of the views' lenses, in each way that may be chosen for them in the end, from the fewest
             lenses on; those of `cameras` if there is none.
+        kind: one of `wishes.LENSES`: of what kind all lenses are.
 
     Raises:
         DatasetError: COLMAP is not installed, or it failed.
@@ -161,6 +163,7 @@ def reconstruct(
         job = {
             "seed": SEED,
             "lenses": [list(some) for some in lenses or (cameras,)],
+            "kind": kind,
             "features": features,
             "tracks": TRACKS if len(names) > MANY else None,
             "threads": os.cpu_count() or 1,

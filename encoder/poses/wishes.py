@@ -8,6 +8,7 @@ from pathlib import Path
 from kpc.format.common.text import option_name
 
 RIGS = ("auto", "still", "moving")
+LENSES = ("auto", "pinhole", "fisheye")
 SYNC_MODES = ("auto", "audio", "motion", "none")
 
 
@@ -21,17 +22,19 @@ class Wishes:
         distance: names of two cameras, or of two pictures of moving ones, and how far apart they are in metres; None
             if unknown.
         require_all: whether to refuse if a camera cannot be placed.
+        lens: one of LENSES: of what kind all lenses are.
     """
 
     rig: str = "auto"
     sync: str | Path = "auto"
     distance: tuple[str, str, float] | None = None
     require_all: bool = False
+    lens: str = "auto"
 
     def changed(self) -> dict[str, str]:
         """Return what differs from the defaults and may change the cameras, as text by the names of options."""
         distance = None if self.distance is None else "{},{}={:g}".format(*self.distance)
-        given = {"rig": self.rig, "sync": str(self.sync), "distance": distance}
+        given = {"rig": self.rig, "sync": str(self.sync), "distance": distance, "lens": self.lens}
         return {name: value for name, value in given.items() if value not in ("auto", None)}
 
     def options_given(self) -> list[str]:
@@ -62,12 +65,15 @@ def add_pose_options(parser: argparse.ArgumentParser) -> None:
         help="how far two cameras, or pictures of moving ones (left/000012), are apart; without it, the largest "
         "distance between cameras is 1",
     )
+    group.add_argument(
+        "--lens", choices=LENSES, default=Wishes.lens, help="of what kind all lenses are (default: %(default)s)"
+    )
     group.add_argument("--require-all", action="store_true", help="fail if a camera or picture cannot be placed")
 
 
 def wishes_from(given: argparse.Namespace) -> Wishes:
     """Return what parsed options say."""
-    return Wishes(given.rig, given.sync, given.distance, given.require_all)
+    return Wishes(given.rig, given.sync, given.distance, given.require_all, given.lens)
 
 
 def _sync(text: str) -> str | Path:

@@ -51,6 +51,14 @@ def test_other_readers_see_the_model_and_the_size(file):
     assert {(frame["w"], frame["h"]) for frame in document["frames"]} == {(256, 192)}
 
 
+@pytest.mark.parametrize("kind, model", [("pinhole", "OPENCV"), ("fisheye", "OPENCV_FISHEYE")])
+def test_the_user_says_of_what_kind_lenses_are(tmp_path, kind, model):
+    write_pictures(tmp_path / "wide", [replace(camera, focal=200.0, is_fisheye=kind == "pinhole") for camera in rig(5)])
+    assert kpposes.main([str(tmp_path / "wide"), "-o", str(tmp_path / "found.json"), "--lens", kind]) == 0
+    frames = json.loads((tmp_path / "found.json").read_text())["frames"]
+    assert {frame.get("camera_model", "OPENCV") for frame in frames} == {model}
+
+
 def test_the_lens_of_a_carried_camera_is_found(tmp_path, capsys):
     places = [replace(CAMERAS[0], pose=pose_at(angle, 1.2 + 0.01 * angle)) for angle in np.linspace(-25, 25, 16)]
     write_walk(tmp_path / "walk" / "walk.mp4", places, 10.0)

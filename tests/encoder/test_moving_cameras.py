@@ -144,7 +144,7 @@ def placed(monkeypatch) -> list[dict]:
     """Place the first twelve views in place of COLMAP; return what is asked for, which is filled in later."""
     asked = []
 
-    def reconstruct(pictures, names, cameras, features, pairing, lenses) -> Structure:
+    def reconstruct(pictures, names, cameras, features, pairing, lenses, kind) -> Structure:
         asked.append({"names": names, "cameras": cameras, "pairing": pairing, "lenses": lenses})
         shown = [picture.view for picture in pictures]
         assert shown == list(range(len(names)))
