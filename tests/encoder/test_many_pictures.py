@@ -13,7 +13,7 @@ SCRIPT = """
 import json, sys
 from pathlib import Path
 import pycolmap
-from kpc.encoder.poses import colmap_worker as worker
+from kpc.encoder.poses import colmap_worker, lenses
 
 pycolmap.logging.minloglevel = 2
 pycolmap.set_random_seed(0)
@@ -25,13 +25,13 @@ with pycolmap.Database.open(file) as database:
     apart = pycolmap.Image(name="apart", camera_id=1, image_id=99)
     database.write_image(apart, use_image_id=True)
 pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.2), model)
-adjusted, counts = worker._adjust, []
-worker._adjust = lambda tried: (counts.append(tried.num_points3D()), adjusted(tried))
-worker.COMPARED = 600
-camera = worker._with_best_cameras(model, [[0] * 8]).cameras[1]
+adjusted, counts = lenses._adjust, []
+lenses._adjust = lambda tried: (counts.append(tried.num_points3D()), adjusted(tried))
+lenses.COMPARED = 600
+camera = lenses.with_best_cameras(model, [[0] * 8], "auto").cameras[1]
 said = {"counts": counts[:], "model": camera.model_name, "focal": camera.params[0]}
-said["views"] = worker._matching_views(file)
-said["cameras"] = len(worker._with_best_cameras(model, [[0] * 8, [0, 1] * 4]).cameras)
+said["views"] = colmap_worker._matching_views(file)
+said["cameras"] = len(lenses.with_best_cameras(model, [[0] * 8, [0, 1] * 4], "auto").cameras)
 print(json.dumps(said))
 """
 
