@@ -116,7 +116,7 @@ def _walls(camera: RigCamera) -> np.ndarray:
 
     A fisheye lens sees the rest of the room, too.
     """
-    rays = _looks(camera) @ camera.pose[:3, :3].T
+    rays = looks(camera) @ camera.pose[:3, :3].T
     centre, picture, nearest = camera.pose[:3, 3], np.zeros((HEIGHT, WIDTH, 3)), np.full((HEIGHT, WIDTH), np.inf)
     for axis, level, along, seed in WALLS + (OTHER_WALLS if camera.is_fisheye else ()):
         with np.errstate(divide="ignore"):
@@ -129,7 +129,7 @@ def _walls(camera: RigCamera) -> np.ndarray:
     return picture
 
 
-def _looks(camera: RigCamera) -> np.ndarray:
+def looks(camera: RigCamera) -> np.ndarray:
     """Return where the pixels look in the camera's frame, (H, W, 3) float64."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     right, up = (x - WIDTH / 2) / camera.focal, -(y - HEIGHT / 2) / camera.focal

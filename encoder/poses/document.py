@@ -45,7 +45,7 @@ def write_document(found: Found, root: Path, file: Path) -> None:
 def _frames_of(found: Found, number: int, root: Path) -> list[dict[str, Any]]:
     """Return the frames of a camera that stands still: its video, or each of its images."""
     footage, clock = found.footage[number], found.clocks[number]
-    camera = _camera(found, number, footage)
+    camera = _camera(found, number, frame_size(footage))
     if footage.video is None:
         times = frame_times(footage) / max(len(footage.files) - 1, 1)
         return [
@@ -76,7 +76,8 @@ def _moving_cameras(found: Found, take: Take, root: Path, folder: Path) -> dict[
             names = {frame: f"{IMAGES}/{name}.png" for frame, name in zip(track.frames, track.frame_names, strict=True)}
             files = {frame: names[frame] for frame in placed}
             _write_frames(footage, track.frames, {frame: folder / file for frame, file in files.items()})
-        cameras = {view: _camera(found, view, footage) for view in track.views if view in found.structure.views}
+        size = frame_size(footage)
+        cameras = {view: _camera(found, view, size) for view in track.views if view in found.structure.views}
         document["frames"] += [
             {"file_path": files[frame], "time": float(time)} | cameras[track.view_of(frame)]
             for frame, time in zip(track.frames, track.times, strict=True)
@@ -99,7 +100,7 @@ def _relative(file: Path, root: Path) -> str:
     return file.relative_to(root).as_posix()
 
 
-def _camera(found: Found, number: int, footage: Footage) -> dict[str, Any]:
+def _camera(found: Found, number: int, size: tuple[int, int]) -> dict[str, Any]:
     view: PlacedView = found.structure.views[number]
     last = ("k3", "k4") if view.is_fisheye else ("p1", "p2")
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", *last)
@@ -108,7 +109,5 @@ def _camera(found: Found, number: int, footage: Footage) -> dict[str, Any]:
     depths = None if found.kind == "photographs" else depth_range(found.structure, number, view)
     near_far = {} if depths is None else {"near": depths[0], "far": depths[1]}
     model = {"camera_model": "OPENCV_FISHEYE"} if view.is_fisheye else {}
-    numbers = dict(zip("wh", frame_size(footage), strict=True)) | {
-        name: float(value) for name, value in (lens | near_far).items()
-    }
+    numbers = dict(zip("wh", size, strict=True)) | {name: float(value) for name, value in (lens | near_far).items()}
     return model | numbers | {"transform_matrix": np.round(view.camera_to_world, 9).tolist()}

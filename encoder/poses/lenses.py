@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
+from kpc.format.scene.camera_models import FISHEYE_MODELS
+
 # Camera models in the order in which they are tried, by their parameters beside the principal point; fisheye ones only
 # where a corner of a picture lies so many degrees or more from the axis.
 PINHOLES = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -31,7 +33,7 @@ CLEARLY, PROBED_PAIRS, PROBED_MATCHES, MANY_MATCHES, PROBING_TRIALS = 1.02, 12, 
 
 
 class AssumedLens(NamedTuple):
-    """A lens as it is assumed before anything is known.
+    """A lens that is assumed before anything is known.
 
     Attributes:
         model: name of the camera model.
@@ -43,7 +45,7 @@ class AssumedLens(NamedTuple):
 
     @property
     def is_fisheye(self) -> bool:
-        return self.model in FISHEYES
+        return self.model in FISHEYE_MODELS
 
     def camera(self, number: int, width: int, height: int) -> pycolmap.Camera:
         """Return a camera with this lens, whose focal length is that of a fisheye to begin with, else anything."""
@@ -116,7 +118,7 @@ def assumed_lens(
 
 def is_fisheye(camera: pycolmap.Camera) -> bool:
     """Return whether a camera's model is a fisheye model."""
-    return camera.model_name in FISHEYES
+    return camera.model_name in FISHEYE_MODELS
 
 
 def rays(camera: pycolmap.Camera, places: np.ndarray) -> np.ndarray:

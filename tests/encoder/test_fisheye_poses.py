@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from textured_room import aligned, pose_at, rig, write_pictures, write_walk
+from textured_room import aligned, looks, pose_at, rig, write_pictures, write_walk
 
 pytest.importorskip("pycolmap", reason="needs pycolmap, of the extra poses")
 pytest.importorskip("scipy", reason="needs scipy, of the extra poses")
@@ -77,10 +77,7 @@ def test_rays_of_the_dataset_are_those_of_the_lens(file, tmp_path):
     assert shown.is_fisheye.all()
     row, column = (axis.ravel() for axis in np.mgrid[: shown.height[0] : 16, : shown.width[0] : 16])
     _, found = pixel_rays(shown, np.zeros(len(row), int), column, row)
-    right, up = (column + 0.5 - 128) / FOCAL, -(row + 0.5 - 96) / FOCAL
-    angle = np.hypot(right, up)
-    share = np.sinc(angle / np.pi)
-    true = np.stack([right * share, up * share, -np.cos(angle)], axis=1) @ shown.camera_to_world[0][:3, :3].T
+    true = looks(CAMERAS[0])[row, column] @ shown.camera_to_world[0][:3, :3].T
     assert np.degrees(np.arccos(np.clip((found * true).sum(1), -1, 1))).max() < 0.5
 
 

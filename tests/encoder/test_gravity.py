@@ -187,7 +187,7 @@ def test_tags_that_are_few_or_disagree_are_not_believed() -> None:
     assert agreed_up(np.concatenate([np.eye(3), -np.eye(3)])) is None
 
 
-def leaning(count: int) -> tuple[np.ndarray, np.ndarray]:
+def tilted(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return cameras (count, 4, 4) in a row that all look 50 degrees down, in a world that lies askew, and its up."""
     rng = np.random.default_rng(3)
     world = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -204,9 +204,9 @@ def structure_of(poses: np.ndarray) -> Structure:
     return Structure(views, poses[:, :3, 3] + 1.0, np.zeros((0, 4)), {})
 
 
-def test_gravity_turns_leaning_cameras_upright() -> None:
+def test_gravity_turns_tilted_cameras_upright() -> None:
     """Cameras that all look down alike show no horizon but their own."""
-    poses, up = leaning(5)
+    poses, up = tilted(5)
     views = {n: PlacedView(pose, (9.0, 9.0, 4.0, 3.0), (0.0,) * 4, 100, 0.2) for n, pose in enumerate(poses)}
     structure = Structure(views, poses[:, :3, 3] + 1.0, np.zeros((0, 4)), {})
     tag = up_of_tags(CameraTags(xmp=DJI.format(-50, 0).encode()))
@@ -237,7 +237,7 @@ def test_gravity_turns_leaning_cameras_upright() -> None:
     ],
 )
 def test_found_cameras_stand_upright(tmp_path, capsys, monkeypatch, rig, pitches, said, lean) -> None:
-    poses, _ = leaning(6)
+    poses, _ = tilted(6)
     views = {n: PlacedView(pose, (9.0, 9.0, 4.0, 3.0), (0.0,) * 4, 100, 0.2) for n, pose in enumerate(poses)}
     structure = Structure(views, poses[:, :3, 3] + 1.0, np.zeros((0, 4)), {})
     monkeypatch.setattr("kpc.encoder.poses.find.reconstruct", lambda *_: structure)

@@ -37,7 +37,7 @@ test('scenes of the same shape share a program, which is kept for a while for th
   shared.release(first);
   assert.deepEqual(done, ['compile a']);
   shared.release(second);
-  assert.deepEqual(shared.get(first, 'a', begin('a')), [program, true]); // whose uniforms may be of a scene that is gone
+  assert.deepEqual(shared.get(first, 'a', begin('a')), [program, true]); // uniforms may be of another scene
   shared.release(first);
   for (const name of 'bcdefghi') shared.get(second, name, begin(name));
   shared.get(second, 'b', begin('b'));

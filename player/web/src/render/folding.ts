@@ -62,13 +62,12 @@ export class FoldedPlanes {
     const key = `${time} ${scene.version}`;
     if (key !== this.#folded) {
       const blocks = this.textures.featured;
-      this.#device.use(this.textures.planes, UNIT.planes);
-      this.#drawBlocks(
-        FOLDING[0],
-        this.#upsampleInto,
-        blocks.filter((block) => !this.#upsampledBlocks.has(block)),
-      );
-      for (const block of blocks) this.#upsampledBlocks.add(block);
+      const changed = blocks.filter((block) => !this.#upsampledBlocks.has(block));
+      if (changed.length > 0) {
+        this.#device.use(this.textures.planes, UNIT.planes);
+        this.#drawBlocks(FOLDING[0], this.#upsampleInto, changed);
+        for (const block of changed) this.#upsampledBlocks.add(block);
+      }
       this.#device.write(this.#rows, timeRows(scene, layout, time, this.layout.upsampling));
       this.#device.use(this.#upsampled, UNIT.planes);
       this.#device.use(this.#rows, UNIT.rows);

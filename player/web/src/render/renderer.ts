@@ -180,7 +180,7 @@ export class Renderer {
     if (this.#scenes.delete(scene)) scene.release();
   }
 
-  /** Have made what `draw` will need for each moment by itself, while planes are still to come; return whether it is. */
+  /** Have made what `draw` will need for each moment by itself, while planes are to come; return whether it is. */
   prepare(camera: Camera, moments: readonly Moment[], options: DrawOptions = {}): boolean {
     if (this.isLost) return true;
     // Nothing is given to the card while it is asked whether it has memory; then textures are made before it is asked.
