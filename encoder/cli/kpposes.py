@@ -41,7 +41,7 @@ def _command(argv: list[str]) -> None:
     file = options.output or options.folder / "transforms.json"
     cli.check_writable(file)
     _refuse_other_document(file)
-    page = file.with_name(NAME)
+    page = file.with_name(NAME if file.name == "transforms.json" else f"{file.stem}.{NAME}")
     check_page(page)
     found = find_poses(options.folder, wishes_from(options))
     write_document(found, options.folder, file)
@@ -102,8 +102,10 @@ def report(found: Found) -> str:
     if found.kind in ("moving camera", "photographs"):
         views = list(found.structure.views.values())
         points = sorted(view.points for view in views)[len(views) // 2]
-        lenses = list(dict.fromkeys(map(lens_text, views)))
-        focal = f"focal length {lenses[0]}" if len(lenses) == 1 else f"{len(lenses)} lenses"
+        lenses = {lens_text(view): view.is_fisheye for view in views}
+        fisheyes = sum(lenses.values())
+        kinds = f", {fisheyes} of them fisheye" if fisheyes else ""
+        focal = f"focal length {next(iter(lenses))}" if len(lenses) == 1 else f"{len(lenses)} lenses{kinds}"
         return f"{len(views)} pictures, error {found.structure.error:.2f} px, {points} points in each, {focal}"
     rows = [(escaped(name), *facts) for name, *facts in camera_table(found)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

@@ -12,9 +12,11 @@ from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.sound import check_sound, sound_of_span
 from kpc.encoder.cli.work_folder import POSES
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.datasets.layouts.nerfstudio import IMAGES
+from kpc.encoder.datasets.capture import holdout_flags
 from kpc.encoder.datasets.loading import has_layout, layouts_of
-from kpc.encoder.poses.footage import find_footage, videos_by_name
+from kpc.encoder.poses.footage import Footage, find_footage, videos_by_name
+from kpc.encoder.poses.survey import frame_count
+from kpc.encoder.poses.takes import frame_names
 from kpc.format.common.errors import UsageError
 from kpc.format.common.media_files import is_hidden, is_image, is_video
 from kpc.format.common.text import notice
@@ -46,10 +48,10 @@ def read_dataset(options: Options) -> Dataset:
         if changed is None:
             notice(f"cameras: those found before, {file}")
         else:
-            if (footage := find_footage(root))[0].video is not None:
-                check_sound(options, {one.files[0].relative_to(root).as_posix(): one.files[0] for one in footage})
+            _check_footage(options, find_footage(root))
             _find_poses(options, file, changed)
-        is_own = (file.parent / IMAGES).is_dir()  # the frames of moving cameras lie beside the document
+        # The frames of moving cameras lie in a folder beside the document.
+        is_own = any(one.is_dir() for one in file.parent.iterdir())
         root, transforms = (file.parent if is_own else root), file
 
     def check(clip: Clip, videos: Mapping[str, Path]) -> None:
@@ -138,6 +140,23 @@ def _asked(options: Options) -> dict[str, Any]:
         "--lens": wishes.lens,
         "the footage": [[str(file), file.stat().st_size, file.stat().st_mtime] for file in files],
     }
+
+
+def _check_footage(options: Options, footage: tuple[Footage, ...]) -> None:
+    """Refuse sound or held-out cameras that footage lacks, as far as is known before its cameras are found.
+
+    Raises:
+        UsageError, DatasetError: as for `check_sound` and `holdout_flags`.
+    """
+    root = options.source
+    files = {file.relative_to(root).as_posix(): file for one in footage for file in one.files}
+    names = list(files)
+    if footage[0].video is not None:
+        check_sound(options, files)
+        for one in footage if options.wishes.rig != "still" else ():
+            frames = frame_names(one.name if len(footage) > 1 else "", range(frame_count(one)))
+            names += [f"{frame}.png" for frame in frames]
+    holdout_flags(root, names, options.holdout, ())
 
 
 def _find_poses(options: Options, file: Path, why: str) -> None:

@@ -288,8 +288,8 @@ def holdout_flags(path: Path, names: Sequence[str], holdout: str | None, default
     Args:
         path: the dataset's folder, for messages.
         names: of the files, relative to it.
-        holdout: a file's name with or without folder and suffix, or that of a folder; "none", or None for the layout's
-            default.
+        holdout: a file's name with or without suffix, or that of a folder, with or without the folders above it;
+            "none", or None for the layout's default.
         default: the layout's default for each file.
 
     Raises:
@@ -299,10 +299,14 @@ def holdout_flags(path: Path, names: Sequence[str], holdout: str | None, default
         return list(default)
     if holdout == "none":
         return [False] * len(names)
-    chosen = [holdout in (name, Path(name).name, Path(name).stem) for name in names]
+
+    def is_meant(path: Path) -> bool:
+        return f"/{path.as_posix()}".endswith(f"/{holdout}")
+
+    paths = list(map(Path, names))
+    chosen = [is_meant(path) or is_meant(path.with_suffix("")) for path in paths]
     if not any(chosen):
-        folders = [[str(folder) for folder in Path(name).parents[:-1]] for name in names]
-        chosen = [holdout in (*own, *(Path(folder).name for folder in own)) for own in folders]
+        chosen = [any(map(is_meant, path.parents)) for path in paths]
     if not any(chosen):
         shown = ", ".join(Path(name).stem for name in names[:4]) + (" ..." if len(names) > 4 else "")
         raise DatasetError(f"{path}: no file or folder is named {holdout!r}; give --holdout one of {shown}")

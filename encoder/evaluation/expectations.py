@@ -13,6 +13,7 @@ from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.datasets.dataset import Dataset
 from kpc.encoder.field.bounds import visible_cells
 from kpc.format.common.images import luma
+from kpc.format.common.text import spanned
 from kpc.format.scene.space import SpaceMapping
 
 # Cells along each side of the box in which it is counted how many cameras see them.
@@ -64,8 +65,8 @@ class Expectations:
         if len(self.neighbours):
             near, middle, far = np.quantile(self.neighbours, (0, 0.5, 1))
             parts.append(
-                f"{near:.3g} to {far:.3g} degrees from the next (median {middle:.3g}) and up to {self.spread:.3g} from "
-                "each other, as seen from what they look at"
+                f"{spanned(f'{near:.3g}', f'{far:.3g}')} degrees from the next (median {middle:.3g}) and up to "
+                f"{self.spread:.3g} from each other, as seen from what they look at"
             )
         if len(self.seen) > 1:
             counts = ", ".join(str(number) for number in range(2, len(self.seen) + 1))

@@ -47,11 +47,11 @@ def main(folder: Path) -> None:
     database = folder / "views.db"
     keypoints = _of_views(job, [places for places, _ in pictures])
     sizes = [job["cameras"][view["camera"]]["size"] for view in job["views"]]
-    lens = assumed_lens(keypoints, sizes, matches, _tolerance(max(map(max, sizes))), job["kind"])
+    lens, is_contradicted = assumed_lens(keypoints, sizes, matches, _tolerance(max(map(max, sizes))), job["kind"])
     _write_views(database, job, keypoints, matches, lens)
     _verify(database, job)
     model, apart = _reconstruct(folder, database, job, lens)
-    found: dict[str, Any] = {"views": {}, "apart": apart}
+    found: dict[str, Any] = {"views": {}, "apart": apart, "is_lens_contradicted": is_contradicted}
     arrays: dict[str, Any] = {}
     if model is not None:
         _say("adjusting lenses", 0, 1)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from kpc.encoder.datasets.layouts.nerfstudio import IMAGES, MADE_BY
+from kpc.encoder.datasets.layouts.nerfstudio import MADE_BY
 from kpc.encoder.datasets.video import read_video
 from kpc.encoder.poses.clocks import Clock
 from kpc.encoder.poses.find import Found, depth_range
@@ -18,9 +18,12 @@ from kpc.format.common import cli
 from kpc.format.common.images import write_image
 from kpc.format.common.progress import progress
 
+# How the name of the folder beside a document ends that holds the frames of moving cameras.
+FRAMES = ".images"
+
 
 def write_document(found: Found, root: Path, file: Path) -> None:
-    """Write the document, and beside it the frames of moving cameras as images.
+    """Write the document, and the frames of videos of moving cameras as images into a folder beside it, NAME.images.
 
     Args:
         found: cameras and clocks.
@@ -33,7 +36,7 @@ def write_document(found: Found, root: Path, file: Path) -> None:
     if found.is_metric:
         document["unit"] = "metre"
     if found.take is not None:
-        document |= _moving_cameras(found, found.take, root, file.parent)
+        document |= _moving_cameras(found, found.take, root, file.with_suffix(FRAMES))
     else:
         document["frames"] = [
             frame for number in sorted(found.structure.views) for frame in _frames_of(found, number, root)
@@ -60,8 +63,8 @@ def _clock(clock: Clock) -> dict[str, float]:
     return offset | ({"time_rate": clock.rate} if clock.rate != 1 else {})
 
 
-def _moving_cameras(found: Found, take: Take, root: Path, folder: Path) -> dict[str, Any]:
-    """Return the clip and the frames of moving cameras: images, or those of videos, which are written into a folder."""
+def _moving_cameras(found: Found, take: Take, root: Path, images: Path) -> dict[str, Any]:
+    """Return the clip and the frames of moving cameras: images, or those of videos, which are written."""
     document: dict[str, Any] = {"frame_count": take.frame_count, "frames": []}
     if take.fps is not None and take.start_s is not None:
         document |= {"fps": take.fps, "start_s": take.start_s}
@@ -73,9 +76,13 @@ def _moving_cameras(found: Found, take: Take, root: Path, folder: Path) -> dict[
         placed = {frame for frame in track.frames if track.view_of(frame) in found.structure.views}
         files = {frame: _relative(footage.files[frame], root) for frame in placed} if footage.video is None else {}
         if footage.video is not None and placed:
-            names = {frame: f"{IMAGES}/{name}.png" for frame, name in zip(track.frames, track.frame_names, strict=True)}
-            files = {frame: names[frame] for frame in placed}
-            _write_frames(footage, track.frames, {frame: folder / file for frame, file in files.items()})
+            names = {
+                frame: f"{images.name}/{name}.png"
+                for frame, name in zip(track.frames, track.frame_names, strict=True)
+                if frame in placed
+            }
+            files |= names
+            _write_frames(footage, track.frames, {frame: images.parent / name for frame, name in names.items()})
         size = frame_size(footage)
         cameras = {view: _camera(found, view, size) for view in track.views if view in found.structure.views}
         document["frames"] += [

@@ -8,6 +8,7 @@ import numpy as np
 from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.poses.orientation import extent
 from kpc.encoder.poses.structure import Structure
+from kpc.format.common.text import spanned
 
 # Views are compared by the features that agree with one geometry of two, if so many do.
 MATCHED = 15
@@ -34,6 +35,10 @@ def doubts(kind: str, names: Sequence[str], structure: Structure) -> list[str]:
         structure: the model.
     """
     found = []
+    if structure.is_lens_contradicted:
+        are_fisheye = any(view.is_fisheye for view in structure.views.values())
+        given, other = ("fisheye", "pinhole") if are_fisheye else ("pinhole", "fisheye")
+        found.append(f"clearly more matches agree with a {other} than with a {given}; try again without --lens {given}")
     shares = {view: share for view, share in confirmed_shares(structure).items() if share < CONFIRMED}
     doubtful = [f"{names[view]} ({share:.0%})" for view, share in shares.items()]
     apart = [names[view] for view in structure.apart]
@@ -49,8 +54,8 @@ def doubts(kind: str, names: Sequence[str], structure: Structure) -> list[str]:
     points = sorted(view.points for view in structure.views.values())
     if points[len(points) // 2] < FEW_POINTS:
         found.append(
-            f"views see few points ({points[0]} to {points[-1]} each), so that places and focal lengths may be "
-            "wrong by some per cent; film at a higher resolution, or with more texture"
+            f"views see few points ({spanned(str(points[0]), str(points[-1]))} each), so that places and focal lengths "
+            "may be wrong by some per cent; film at a higher resolution, or with more texture"
         )
     if kind == "still rig":
         found += [f"{names[one]} and {names[two]} were placed at one point" for one, two in _at_one_place(structure)]

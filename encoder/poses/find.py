@@ -33,7 +33,7 @@ from kpc.encoder.poses.wishes import Wishes
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info, read_image
 from kpc.format.common.progress import progress
-from kpc.format.common.text import agreeing, counted, notice
+from kpc.format.common.text import agreeing, counted, notice, spanned
 
 # Attempts at a still rig: features in each picture, and instants at which what moves is matched.
 ATTEMPTS = ((4096, 4), (8192, 10))
@@ -120,8 +120,11 @@ def _is_numbered(footage: Sequence[Footage]) -> bool:
 
 
 def _what(footage: Sequence[Footage], surveys: Sequence[Survey], is_still: bool, rig: str) -> str:
-    shares = [f"{seen.still_share:.0%}" for seen in surveys if np.isfinite(seen.still_share)]
-    why = "as --rig says" if rig != "auto" else f"{min(shares, default='?')} of a picture's texture stays, or more"
+    shares = sorted(seen.still_share for seen in surveys if np.isfinite(seen.still_share))
+    why = "as --rig says"
+    if rig == "auto":
+        stays = f"{spanned(f'{shares[0]:.0%}', f'{shares[-1]:.0%}')} of a picture's texture stays" if shares else ""
+        why = stays or "pictures have no texture"
     if is_still:
         stand = agreeing(len(footage), "stands", "stand")
         return f"taken for a rig of {counted(len(footage), 'camera')} that {stand} still ({why})"

@@ -61,14 +61,23 @@ PINHOLE = AssumedLens("SIMPLE_RADIAL", 1.2)
 FISHEYE_LENSES = tuple(AssumedLens("SIMPLE_RADIAL_FISHEYE", focal) for focal in (0.2, 0.26, 0.33, 0.4, 0.5, 0.64))
 
 
+class LensChoice(NamedTuple):
+    """Which lens is assumed, and whether clearly more matches agree with one of the other kind."""
+
+    lens: AssumedLens
+    is_contradicted: bool
+
+
 def assumed_lens(
     keypoints: Sequence[np.ndarray],
     sizes: Sequence[tuple[int, int]],
     matches: Mapping[tuple[int, int], np.ndarray],
     tolerance: float,
     kind: str,
-) -> AssumedLens:
+) -> LensChoice:
     """Return the lens with which most matches agree: a pinhole, or a fisheye lens if that is clearly better.
+
+    One of the kind that the user names is assumed though matches may contradict it.
 
     Those of a pinhole agree with a fundamental matrix, whatever its focal length; those of a fisheye lens with an
     essential matrix, if its focal length is about right.
@@ -80,8 +89,6 @@ def assumed_lens(
         tolerance: pixels that a match may be off.
         kind: one of `wishes.LENSES`: of what kind the lens is.
     """
-    if kind == "pinhole":
-        return PINHOLE
     options = pycolmap.RANSACOptions(max_error=tolerance, max_num_trials=PROBING_TRIALS, random_seed=0)
 
     def places(pair: tuple[int, int]) -> list[np.ndarray]:
@@ -111,9 +118,11 @@ def assumed_lens(
             count += 0 if found is None else int(found["num_inliers"])
         return count
 
-    counts = {lens: agreeing(lens) for lens in FISHEYE_LENSES}
+    counts = {lens: agreeing(lens) for lens in (PINHOLE, *FISHEYE_LENSES)}
     best = max(FISHEYE_LENSES, key=counts.__getitem__)
-    return best if kind == "fisheye" or counts[best] > CLEARLY * agreeing(PINHOLE) else PINHOLE
+    if kind == "fisheye" or (kind == "auto" and counts[best] > CLEARLY * counts[PINHOLE]):
+        return LensChoice(best, counts[PINHOLE] > CLEARLY * counts[best])
+    return LensChoice(PINHOLE, counts[best] > CLEARLY * counts[PINHOLE])
 
 
 def is_fisheye(camera: pycolmap.Camera) -> bool:

@@ -101,6 +101,7 @@ class Structure:
         pairs: how the features of each two views match.
         apart: views that were not placed with these, but with each other.
         dropped: views that were placed, but see too little of what the others see to be believed.
+        is_lens_contradicted: whether clearly more matches agree with a lens of the other kind than the user named.
     """
 
     views: dict[int, PlacedView]
@@ -109,6 +110,7 @@ class Structure:
     pairs: dict[tuple[int, int], Pair]
     apart: tuple[int, ...] = ()
     dropped: tuple[int, ...] = ()
+    is_lens_contradicted: bool = False
 
     @property
     def error(self) -> float:
@@ -298,6 +300,7 @@ def _read(folder: Path) -> Structure:
         arrays["observations"] if "observations" in arrays else np.zeros((0, 4)),
         {(one, two): Pair(*facts) for one, two, *facts in found["pairs"]},
         tuple(found["apart"]),
+        is_lens_contradicted=found["is_lens_contradicted"],
     )
 
 

@@ -67,6 +67,11 @@ def agreeing(count: int, one: str, more: str) -> str:
     return one if count == 1 else more
 
 
+def spanned(low: str, high: str) -> str:
+    """Return a range of two numbers as text, or the number that both are."""
+    return low if low == high else f"{low} to {high}"
+
+
 def byte_text(count: int) -> str:
     """Return a number of bytes for a message, in the largest unit of which it is one: "20 KB", "1.5 GB"."""
     power = max((p for p in (9, 6, 3) if count >= 10**p), default=0)

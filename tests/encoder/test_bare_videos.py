@@ -285,6 +285,17 @@ def test_cameras_are_named_by_their_folders(tmp_path):
     assert [footage.name for footage in find_footage(tmp_path)] == ["left", "right"]
 
 
+@pytest.mark.parametrize("holdout", ["bb", "c/000003", "bb/000001"])
+def test_what_is_held_out_is_looked_up_before_cameras_are_found(tmp_path, monkeypatch, holdout):
+    (tmp_path / "set").mkdir()
+    for name in ("a", "b", "c"):
+        film(tmp_path / "set" / f"{name}.mp4", count=3)
+    monkeypatch.setattr("kpc.encoder.poses.find.find_poses", lambda *_: pytest.fail("cameras are looked for"))
+    options = parse([str(tmp_path / "set"), "-o", str(tmp_path / "x.kpc"), "--holdout", holdout])[0]
+    with pytest.raises(DatasetError, match=f"no file or folder is named '{holdout}'; give --holdout one of a, b, c"):
+        read_dataset.read_dataset(options)
+
+
 def test_an_empty_folder_is_refused(tmp_path):
     with pytest.raises(DatasetError, match="holds no videos"):
         find_footage(tmp_path)

@@ -41,7 +41,7 @@ def test_a_dense_rig_is_described_without_warning(tmp_path: Path) -> None:
     aside = np.degrees(1 / 9) * 3 / np.hypot(3, 0.8)  # on the circle at the cameras' height
     assert found.neighbours == pytest.approx(np.full(10, aside), rel=0.01)
     assert found.seen[0] > found.seen[1] >= found.seen[2] > 0.2
-    assert "10 cameras; 6.15 to 6.15 degrees from the next" in found.paragraph()
+    assert "10 cameras; 6.15 degrees from the next" in found.paragraph()
     assert "exposures of neighbours within 0.0 stops; none of 10 blurred" in found.paragraph()
 
 

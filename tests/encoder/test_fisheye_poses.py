@@ -59,6 +59,16 @@ def test_the_user_says_of_what_kind_lenses_are(tmp_path, kind, model):
     assert {frame.get("camera_model", "OPENCV") for frame in frames} == {model}
 
 
+@pytest.mark.parametrize("is_fisheye", [False, True])
+def test_it_is_said_if_lenses_are_clearly_of_the_other_kind(tmp_path, capsys, is_fisheye):
+    write_pictures(tmp_path / "wide", [replace(camera, is_fisheye=is_fisheye) for camera in CAMERAS])
+    true, other = ("fisheye", "pinhole") if is_fisheye else ("pinhole", "fisheye")
+    warning = f"warning: clearly more matches agree with a {true} than with a {other}; try again without --lens {other}"
+    for given in (true, other):
+        kpposes.main([str(tmp_path / "wide"), "-o", str(tmp_path / "found.json"), "--lens", given])
+        assert (warning in capsys.readouterr().err) == (given == other)
+
+
 def test_the_lens_of_a_carried_camera_is_found(tmp_path, capsys):
     places = [replace(CAMERAS[0], pose=pose_at(angle, 1.2 + 0.01 * angle)) for angle in np.linspace(-25, 25, 16)]
     write_walk(tmp_path / "walk" / "walk.mp4", places, 10.0)

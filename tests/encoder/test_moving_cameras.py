@@ -11,6 +11,7 @@ from PIL import Image
 
 pytest.importorskip("scipy", reason="needs scipy, of the extra poses")
 
+from kpc.encoder.cli import kpposes
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.sound import find_sound
 from kpc.encoder.datasets import load_dataset
@@ -71,8 +72,6 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def file(walks: Path) -> Path:
     """The document that `kpposes` writes about them, in a folder of its own."""
     pytest.importorskip("pycolmap", reason="needs pycolmap, of the extra poses")
-    from kpc.encoder.cli import kpposes
-
     file = walks.parent / "found" / "transforms.json"
     file.parent.mkdir()
     assert kpposes.main([str(walks), "-o", str(file), "--require-all", "--distance", "left/000002,right/000000=3"]) == 0
@@ -121,6 +120,21 @@ def test_a_dataset_of_images_with_the_sound_of_the_videos_is_read_back(walks, fi
         assert found == f"{name}.mp4"
         samples = decoded(sound)[:, 0]
         assert abs(offset_of(samples, expected[: len(samples)])) < 0.001 * SAMPLE_RATE
+
+
+def test_documents_in_one_folder_have_frames_and_pages_of_their_own(films, placed, tmp_path):
+    for name in ("one", "two"):
+        assert kpposes.main([str(films), "-o", str(tmp_path / f"{name}.json"), "--rig", "moving"]) == 0
+        paths = [frame["file_path"] for frame in json.loads((tmp_path / f"{name}.json").read_text())["frames"]]
+        assert paths == [f"{name}.images/a/{number:06d}.png" for number in range(12)]
+        assert all((tmp_path / path).is_file() for path in paths)
+        assert (tmp_path / f"{name}.cameras.html").is_file()
+
+
+@pytest.mark.parametrize("holdout, count", [("left", 12), ("left/000003", 1), ("000003", 2), ("right/000003.png", 1)])
+def test_a_camera_or_a_picture_is_held_out_by_its_name(file, tmp_path, holdout, count):
+    held_out = nerfstudio.read(file.parent, holdout, file).views
+    assert sum(view.is_test for view in held_out) == count
 
 
 def test_the_page_shows_the_paths_and_a_picture_of_each(file):
@@ -236,7 +250,7 @@ def test_a_camera_that_stands_still_among_others_is_one_view(films, placed, monk
     monkeypatch.setattr(find, "survey", lambda one: replace(seen, still_share=shares[one.name]))
     found = find.find_poses(films, Wishes())
     assert (
-        "taken for 1 camera that moves and 1 that stands still, a (10% of a picture's texture"
+        "taken for 1 camera that moves and 1 that stands still, a (10% to 90% of a picture's texture"
         in capsys.readouterr().err
     )
     assert found.view_names[:3] == ("a", "b/000000", "b/000001")

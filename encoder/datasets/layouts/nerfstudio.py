@@ -25,9 +25,8 @@ from kpc.format.scene.camera_checks import number_of
 # The layout's name in messages.
 NAME = "nerfstudio"
 
-# What a document of `kpposes` says it was made by, and the folder beside it that holds the frames of moving cameras,
-# of several in a folder for each.
-MADE_BY, IMAGES = "kpposes", "images"
+# What a document of `kpposes` says it was made by.
+MADE_BY = "kpposes"
 
 
 def recognise(path: Path) -> bool:
@@ -88,4 +87,6 @@ def _named_by_folder(path: Path, views: tuple[CapturedView, ...]) -> tuple[Captu
     if len({view.file.stem for view in views}) == len(views):
         return views
     names = [view.file.relative_to(path).with_suffix("").as_posix() for view in views]
-    return tuple(replace(view, camera=name.removeprefix(f"{IMAGES}/")) for view, name in zip(views, names, strict=True))
+    if len({name.partition("/")[0] for name in names}) == 1:  # the folder into which `kpposes` wrote all frames
+        names = [name.partition("/")[2] for name in names]
+    return tuple(replace(view, camera=name) for view, name in zip(views, names, strict=True))
