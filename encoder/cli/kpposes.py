@@ -45,7 +45,7 @@ def _command(argv: list[str]) -> None:
     check_page(page)
     found = find_poses(options.folder, wishes_from(options))
     write_document(found, options.folder, file)
-    _say_if_not_read(options.folder, file)
+    _say_if_not_read(found, options.folder, file)
     write_page(found, f"Cameras of {options.folder.resolve().name}", page)
     print(report(found))
     print(escaped(f"{page}: where the cameras stand, and what they see"))
@@ -87,9 +87,12 @@ def _refuse_other_document(file: Path) -> None:
     notice(f"replaces {file}, with any edits in it, once the cameras are found")
 
 
-def _say_if_not_read(folder: Path, file: Path) -> None:
-    """Say that kpenc reads other poses of the folder, if there are any, and not the document."""
+def _say_if_not_read(found: Found, folder: Path, file: Path) -> None:
+    """Say where kpenc reads the document, or that it reads other poses of the folder."""
     layouts = layouts_of(folder) if file.resolve() == folder.resolve() / "transforms.json" else []
+    read = (file.parent if found.writes_frames else folder) / "transforms.json"
+    if file.resolve() != read.resolve():
+        notice(f"{file}: kpenc reads these cameras once the file is {read}")
     if layouts and layouts[0].NAME != NERFSTUDIO:
         notice(
             f"{file}: warning: kpenc reads the folder in the layout of {layouts[0].NAME}, and not this file; to use "

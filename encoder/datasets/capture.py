@@ -308,8 +308,11 @@ def holdout_flags(path: Path, names: Sequence[str], holdout: str | None, default
     if not any(chosen):
         chosen = [any(map(is_meant, path.parents)) for path in paths]
     if not any(chosen):
-        shown = ", ".join(Path(name).stem for name in names[:4]) + (" ..." if len(names) > 4 else "")
-        raise DatasetError(f"{path}: no file or folder is named {holdout!r}; give --holdout one of {shown}")
+        folders = list(dict.fromkeys(folder.name for folder in (one.parent for one in paths) if folder.name))
+        known = folders if len(folders) > 1 else [one.stem for one in paths]
+        raise DatasetError(
+            f"{path}: no file or folder is named {holdout!r}; give --holdout one of {first_names(known)}"
+        )
     return chosen
 
 

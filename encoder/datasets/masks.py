@@ -17,8 +17,8 @@ from kpc.format.common.images import image_info, read_mask
 from kpc.format.common.progress import Progress
 from kpc.format.common.text import agreeing, counted, notice
 
-# The folder of masks within a dataset.
-FOLDER = "masks"
+# The folder of masks within a dataset, and how names of instant-ngp's masks begin, which lie beside the images.
+FOLDER, DYNAMIC_MASK = "masks", "dynamic_mask_"
 
 # Pixels per block of the rank index: a block takes 8 bytes of memory, and drawing a pixel reads 64 bytes.
 BLOCK = 512

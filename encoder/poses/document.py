@@ -1,6 +1,10 @@
 """`transforms.json` of what was found, in the layout of nerfstudio with clocks."""
 
+import itertools
 import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,20 +14,21 @@ from kpc.encoder.datasets.layouts.nerfstudio import MADE_BY
 from kpc.encoder.datasets.video import read_video
 from kpc.encoder.poses.clocks import Clock
 from kpc.encoder.poses.find import Found, depth_range
-from kpc.encoder.poses.footage import Footage, frame_size
+from kpc.encoder.poses.footage import FRAMES, Footage, frame_size
 from kpc.encoder.poses.instants import frame_times
 from kpc.encoder.poses.structure import PlacedView
 from kpc.encoder.poses.takes import Take
 from kpc.format.common import cli
 from kpc.format.common.images import write_image
 from kpc.format.common.progress import progress
-
-# How the name of the folder beside a document ends that holds the frames of moving cameras.
-FRAMES = ".images"
+from kpc.format.common.text import notice
 
 
 def write_document(found: Found, root: Path, file: Path) -> None:
-    """Write the document, and the frames of videos of moving cameras as images into a folder beside it, NAME.images.
+    """Write the document, and the frames of videos of moving cameras as images into a new folder beside it.
+
+    That is NAME.images, or NAME.images-2 and so on where there is one, which another document may name; it is removed
+    if not all can be written.
 
     Args:
         found: cameras and clocks.
@@ -35,14 +40,34 @@ def write_document(found: Found, root: Path, file: Path) -> None:
     document: dict[str, Any] = {"camera_model": model, "made_by": MADE_BY, "kind": found.kind}
     if found.is_metric:
         document["unit"] = "metre"
-    if found.take is not None:
-        document |= _moving_cameras(found, found.take, root, file.with_suffix(FRAMES))
-    else:
-        document["frames"] = [
-            frame for number in sorted(found.structure.views) for frame in _frames_of(found, number, root)
-        ]
-    with cli.atomic_write(file) as aside:
-        Path(aside).write_text(json.dumps(document, indent=1) + "\n")
+    with _new_folder(file.with_suffix(FRAMES)) if found.writes_frames else nullcontext(root) as images:
+        if found.take is not None:
+            document |= _moving_cameras(found, found.take, root, images)
+        else:
+            document["frames"] = [
+                frame for number in sorted(found.structure.views) for frame in _frames_of(found, number, root)
+            ]
+        with cli.atomic_write(file) as aside:
+            Path(aside).write_text(json.dumps(document, indent=1) + "\n")
+
+
+@contextmanager
+def _new_folder(path: Path) -> Iterator[Path]:
+    """Make a folder of a name, or of that name and a number if there is one already; remove it on failure."""
+    folder = path
+    for number in itertools.count(2):
+        try:
+            folder.mkdir()
+            break
+        except FileExistsError:
+            folder = path.with_name(f"{path.name}-{number}")
+    if folder != path:
+        notice(f"{path}: stays, since another document may name its images; new ones are written into {folder.name}")
+    try:
+        yield folder
+    except BaseException:
+        shutil.rmtree(folder)
+        raise
 
 
 def _frames_of(found: Found, number: int, root: Path) -> list[dict[str, Any]]:
@@ -64,7 +89,7 @@ def _clock(clock: Clock) -> dict[str, float]:
 
 
 def _moving_cameras(found: Found, take: Take, root: Path, images: Path) -> dict[str, Any]:
-    """Return the clip and the frames of moving cameras: images, or those of videos, which are written."""
+    """Return the clip and the frames of moving cameras: images, or those of videos, which are written into a folder."""
     document: dict[str, Any] = {"frame_count": take.frame_count, "frames": []}
     if take.fps is not None and take.start_s is not None:
         document |= {"fps": take.fps, "start_s": take.start_s}

@@ -11,7 +11,7 @@ from kpc.encoder.datasets.capture import first_names
 from kpc.encoder.poses.clocks import UNKNOWN, Clock
 from kpc.encoder.poses.doubts import MATCHED, by_camera, doubts
 from kpc.encoder.poses.false_views import without_false_views
-from kpc.encoder.poses.footage import Footage, find_footage, frame_size
+from kpc.encoder.poses.footage import Footage, find_footage, frame_size, left_out
 from kpc.encoder.poses.given_clocks import read_clocks
 from kpc.encoder.poses.gravity import LEAST_TAGS, agreed_up, tagged_up
 from kpc.encoder.poses.instants import Picture, grey_of, moving_pictures, still_pictures
@@ -75,6 +75,11 @@ class Found:
     motion: tuple[np.ndarray, ...] = ()
     take: Take | None = None
 
+    @property
+    def writes_frames(self) -> bool:
+        """Whether frames are written as images beside the document: those of the videos of cameras that move."""
+        return self.take is not None and self.footage[0].video is not None
+
 
 def find_poses(root: Path, wishes: Wishes) -> Found:
     """Find cameras and clocks of the footage in a folder; say in one line what it is taken for.
@@ -86,6 +91,12 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
     """
     footage = find_footage(root)
     check_installed()
+    if unused := left_out(root, footage):
+        notice(
+            f"{root}: {counted(len(unused), 'file')} beside the {'videos' if footage[0].video else 'images'} "
+            f"{agreeing(len(unused), 'belongs to no camera and is', 'belong to no camera and are')} left out: "
+            f"{first_names(unused)}"
+        )
     counts = [frame_count(one) for one in footage]
     if max(counts) == 1 and footage[0].video is not None:
         raise DatasetError(f"{root}: its videos have one frame each; give whole videos, or photographs as images")

@@ -1,10 +1,14 @@
 """What a folder without poses holds: a video for each camera, folders of frames, or photographs."""
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from kpc.encoder.datasets.capture import natural_key
 from kpc.encoder.datasets.left_out import media_in
+from kpc.encoder.datasets.masks import DYNAMIC_MASK
+from kpc.encoder.datasets.masks import FOLDER as MASKS
 from kpc.encoder.datasets.video import VideoInfo, video_info
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
@@ -12,6 +16,8 @@ from kpc.format.common.media_files import is_hidden, is_image, is_video
 
 # Folders of frames have at least as many images; fewer are photographs.
 LEAST_FRAMES = 5
+# How the names of folders end into which `kpposes` writes frames; a number follows where there are several.
+FRAMES = ".images"
 
 
 @dataclass(frozen=True)
@@ -37,17 +43,31 @@ def find_footage(root: Path) -> tuple[Footage, ...]:
         MediaError: a video cannot be read.
     """
     videos, folders = videos_by_name(root), _frame_folders(root)
-    images = [file for file in media_in(root) if is_image(file)]
+    images = _images_in(root)
     if videos:
         return tuple(Footage(name, (file,), video_info(file)) for name, file in videos.items())
     if folders:
         return tuple(Footage(name, files, None) for name, files in folders.items())
-    images = images or [file for file in _of_only_folder(root) if is_image(file)]
+    images = images or _of_only_folder(root)
     if len(images) < 3:
         raise DatasetError(
             f"{root}: holds no videos, folders of frames, or three photographs; give a video for each camera"
         )
     return tuple(Footage(file.stem, (file,), None) for file in sorted(images, key=lambda file: natural_key(file.name)))
+
+
+def left_out(root: Path, footage: Iterable[Footage]) -> list[str]:
+    """Return the names of images and videos in a folder, or in its folders, that belong to no camera."""
+    used = {file for one in footage for file in one.files}
+    found = [file for folder in (root, *_folders(root)) for file in media_in(folder)]
+    return sorted(
+        (
+            file.relative_to(root).as_posix()
+            for file in found
+            if file not in used and not file.name.startswith(DYNAMIC_MASK)
+        ),
+        key=natural_key,
+    )
 
 
 def frame_size(footage: Footage) -> tuple[int, int]:
@@ -78,16 +98,29 @@ def videos_by_name(root: Path) -> dict[str, Path]:
 def _frame_folders(root: Path) -> dict[str, tuple[Path, ...]]:
     found = {}
     for folder in _folders(root):
-        images = [file for file in media_in(folder) if is_image(file)]
+        images = _images_in(folder)
         if len(images) >= LEAST_FRAMES:
             found[folder.name] = tuple(sorted(images, key=lambda file: natural_key(file.name)))
     return {name: found[name] for name in sorted(found, key=natural_key)} if len(found) > 1 else {}
 
 
 def _of_only_folder(root: Path) -> list[Path]:
-    folders = [folder for folder in _folders(root) if any(map(is_image, folder.iterdir()))]
-    return media_in(folders[0]) if len(folders) == 1 else []
+    folders = [images for folder in _folders(root) if (images := _images_in(folder))]
+    return folders[0] if len(folders) == 1 else []
+
+
+def _images_in(folder: Path) -> list[Path]:
+    """Return the images in a folder but for masks."""
+    return [file for file in media_in(folder) if is_image(file) and not file.name.startswith(DYNAMIC_MASK)]
 
 
 def _folders(root: Path) -> list[Path]:
-    return sorted(folder for folder in root.iterdir() if folder.is_dir() and not is_hidden(folder))
+    """Return the folders in a folder that may hold footage: neither masks nor frames that `kpposes` has written."""
+    return sorted(
+        folder
+        for folder in root.iterdir()
+        if folder.is_dir()
+        and not is_hidden(folder)
+        and folder.name != MASKS
+        and not re.fullmatch(rf".+{re.escape(FRAMES)}(-\d+)?", folder.name)
+    )

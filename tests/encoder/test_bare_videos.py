@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import textured_room
 from kpc.encoder.datasets import load_dataset
 from kpc.encoder.evaluation.camera_page import write_camera_page
-from kpc.encoder.poses.footage import find_footage
+from kpc.encoder.poses.footage import find_footage, left_out
 from kpc.format.common.errors import DatasetError
 from textured_room import FOCAL, FPS, SIZE, aligned, rig, write_films, write_pictures
 from videos import film
@@ -294,6 +295,28 @@ def test_what_is_held_out_is_looked_up_before_cameras_are_found(tmp_path, monkey
     options = parse([str(tmp_path / "set"), "-o", str(tmp_path / "x.kpc"), "--holdout", holdout])[0]
     with pytest.raises(DatasetError, match=f"no file or folder is named '{holdout}'; give --holdout one of a, b, c"):
         read_dataset.read_dataset(options)
+
+
+def test_of_a_mixture_it_is_said_what_is_left_out(tmp_path, capsys):
+    for name in ("a.mp4", "b.mp4"):
+        film(tmp_path / name)
+    (tmp_path / "transforms.images-2").mkdir()
+    (tmp_path / "photos").mkdir()
+    for name in ("c.png", "photos/d.png", "transforms.images-2/e.png", "dynamic_mask_c.png"):
+        Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / name)
+    assert kpposes.main([str(tmp_path), "-o", str(tmp_path / "x.json"), "--rig", "still"]) == 1
+    said = "2 files beside the videos belong to no camera and are left out: c.png, photos/d.png\n"
+    assert said in capsys.readouterr().err
+
+
+def test_masks_are_no_footage(tmp_path):
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+        for number in range(6):
+            Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / folder / f"{number}.png")
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "images" / "dynamic_mask_0.png")
+    footage = find_footage(tmp_path)
+    assert [one.files[0].parent.name for one in footage] == ["images"] * 6 and left_out(tmp_path, footage) == []
 
 
 def test_an_empty_folder_is_refused(tmp_path):

@@ -131,6 +131,37 @@ def test_documents_in_one_folder_have_frames_and_pages_of_their_own(films, place
         assert (tmp_path / f"{name}.cameras.html").is_file()
 
 
+def test_frames_of_an_earlier_document_stay(films, placed, tmp_path, monkeypatch, capsys):
+    def run() -> set[str]:
+        assert kpposes.main([str(films), "-o", str(tmp_path / "one.json"), "--rig", "moving"]) == 0
+        paths = [frame["file_path"] for frame in json.loads((tmp_path / "one.json").read_text())["frames"]]
+        assert all((tmp_path / path).is_file() for path in paths)
+        return {path.partition("/")[0] for path in paths}
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    (tmp_path / "one.images").mkdir()
+    assert run() == {"one.images-2"} and f"{tmp_path / 'one.images'}: stays" in capsys.readouterr().err
+    (tmp_path / "one.json").rename(tmp_path / "transforms.json")
+    assert run() == {"one.images-3"}
+    before = (tmp_path / "one.json").read_bytes()
+    monkeypatch.setattr("kpc.encoder.poses.document.write_image", interrupt)
+    assert kpposes.main([str(films), "-o", str(tmp_path / "one.json"), "--rig", "moving"]) == 130
+    assert (tmp_path / "one.json").read_bytes() == before and not (tmp_path / "one.images-4").exists()
+    assert sorted(folder.name for folder in tmp_path.glob("*.images*")) == [f"one.images{n}" for n in ("", "-2", "-3")]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("out/A.json", "kpenc reads these cameras once the file is"), ("out/transforms.json", "")]
+)
+def test_it_is_said_where_a_document_is_read(films, placed, tmp_path, capsys, name, said):
+    (tmp_path / "out").mkdir()
+    assert kpposes.main([str(films), "-o", str(tmp_path / name), "--rig", "moving"]) == 0
+    found = f"{said} {tmp_path / 'out' / 'transforms.json'}" in capsys.readouterr().err
+    assert found == bool(said)
+
+
 @pytest.mark.parametrize("holdout, count", [("left", 12), ("left/000003", 1), ("000003", 2), ("right/000003.png", 1)])
 def test_a_camera_or_a_picture_is_held_out_by_its_name(file, tmp_path, holdout, count):
     held_out = nerfstudio.read(file.parent, holdout, file).views

@@ -23,6 +23,7 @@ from kpc.encoder.datasets.capture import (
 )
 from kpc.encoder.datasets.layouts.documents import read_json
 from kpc.encoder.datasets.layouts.transforms_keys import check_keys
+from kpc.encoder.datasets.masks import DYNAMIC_MASK
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
 from kpc.format.common.media_files import is_video
@@ -304,7 +305,7 @@ def _check_rays(where: str, keys: dict[str, Any], image: Path) -> None:
 def _mask(root: Path, file: Path, where: str, keys: dict[str, Any], image: Path) -> MaskFile | None:
     """Return the mask that `mask_path` names, or instant-ngp's `dynamic_mask_NAME.png` beside the image."""
     name = keys.get("mask_path") or None
-    dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")
+    dynamic = image.with_name(f"{DYNAMIC_MASK}{image.stem}.png")
     if name is None:
         return MaskFile(dynamic, marks_ignored=True) if file_exists(dynamic) else None
     mask = find_image(root, file, name) if isinstance(name, str) else None
