@@ -62,6 +62,15 @@ def store(builder: Any, vector: Any, data: Any, at: Any) -> None:
     builder.store(vector, builder.bitcast(builder.gep(data, [at]), vector.type.as_pointer())).align = 4
 
 
+def prefetch(builder: Any, place: Any) -> None:
+    """Have the processor fetch the line of its cache that holds a place, without waiting for it."""
+    byte = ir.IntType(8).as_pointer()
+    kind = ir.FunctionType(ir.VoidType(), [byte, LANE, LANE, LANE])
+    read, all_levels, data = LANE(0), LANE(3), LANE(1)
+    fetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
+    builder.call(fetch, [builder.bitcast(place, byte), read, all_levels, data])
+
+
 def spread(builder: Any, value: Any, count: int) -> Any:
     """Return a vector of `count` times one number."""
     vector = builder.insert_element(ir.Constant(vector_type(count), ir.Undefined), value, LANE(0))
@@ -71,6 +80,11 @@ def spread(builder: Any, value: Any, count: int) -> Any:
 def picked(builder: Any, one: Any, other: Any, lanes: Sequence[int] | range) -> Any:
     """Return these numbers of two vectors, counted through."""
     return builder.shuffle_vector(one, other, ir.Constant(vector_type(len(lanes), LANE), list(lanes)))
+
+
+def padded(builder: Any, vector: Any, count: int, wide: int) -> Any:
+    """Return a vector of `wide` numbers: the `count` of another one, and then zeros."""
+    return picked(builder, vector, constant(0.0, count), [*range(count), *[count] * (wide - count)])
 
 
 def product(builder: Any, *factors: Any) -> Any:
@@ -129,14 +143,17 @@ def exponential(builder: Any, x: Any, wide: int) -> Any:
     return builder.select(builder.fcmp_unordered("uno", x, x), x, builder.fmul(series, power))
 
 
-def for_each_vector(builder: Any, count: Any, wide: int, emit: Callable[[Any, int], None]) -> None:
-    """Write loops over `count` numbers: by `wide`, a power of two, and then one by one over what remains.
+def for_each_vector(builder: Any, count: Any, widths: Sequence[int], emit: Callable[[Any, int], None]) -> None:
+    """Write loops over `count` numbers, one for each width: as many as it fits, and then the next over what remains.
 
     Args:
         count: int64.
-        emit: writes the body, given the first number and how many the vectors of this loop hold, `wide` or 1.
+        widths: powers of two from large to small, of which the last is 1.
+        emit: writes the body, given the first number and the width of this loop.
     """
-    whole = builder.and_(count, INDEX(-wide))
-    for start, stop, step in ((INDEX(0), whole, wide), (whole, count, 1)):
-        with cgutils.for_range_slice(builder, start, stop, INDEX(step), inc=True) as (at, _):
-            emit(at, step)
+    start = INDEX(0)
+    for width in widths:
+        stop = builder.and_(count, INDEX(-width))
+        with cgutils.for_range_slice(builder, start, stop, INDEX(width), inc=True) as (at, _):
+            emit(at, width)
+        start = stop

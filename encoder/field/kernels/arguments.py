@@ -70,6 +70,8 @@ class RayBuffers(NamedTuple):
 
     values: np.ndarray  # (K, S * 6 * M) float32, what each plane holds at a sample
     features: np.ndarray  # (K, F) float32
+    texels: np.ndarray  # (K * S, PLACES) int32, of each plane the first texel around a sample; -1: outside of the area
+    shares: np.ndarray  # (K * S, 4) float32, of the way to the next texel along x, y, z and t
     local: np.ndarray  # (1, 4) float32: u in the area of a scale, and time, of the current sample
     points: np.ndarray  # (K, POINT) float32: u displaced, time, u before displacement, time
     s: np.ndarray  # (K,) float32
@@ -78,6 +80,8 @@ class RayBuffers(NamedTuple):
     weights: np.ndarray  # (K,) float32, transmittance times alpha
     decoded: np.ndarray  # (K, 4) float32, log density without bias, and logits, which become colours
     g_weights: np.ndarray  # (K,) float32, gradient of the distortion loss with respect to the weights
+    drawn: np.ndarray  # (K,) int32, the samples whose gradients are computed
+    g_log_taus: np.ndarray  # (K,) float32, of each of them the gradient of the logarithm of its thickness
     g_features: np.ndarray  # (1, F) float32, of the current sample
     decoder: np.ndarray  # (4 * F,) float32, weights of the log density and of three colours, of the current ray
     g_decoder: np.ndarray  # (4 * F,) float32, their gradient

@@ -13,7 +13,7 @@ from kpc.encoder.field.kernels.marching import (
     new_ray_buffers,
     shade_ray,
 )
-from kpc.encoder.field.kernels.planes import scatter_planes
+from kpc.encoder.field.kernels.planes import fetch_texels, scatter_planes
 from kpc.encoder.field.kernels.texels import add_displacement_slopes, displace_transpose
 from kpc.encoder.field.kernels.vectors import add_decoder_gradient, decode_transpose
 from kpc.encoder.field.occupancy_grid import OccupancyGrid
@@ -74,6 +74,53 @@ def first_draw(buffers, volume):
     return buffers.s[0] / volume.step * np.float32(64.0) % np.float32(1.0)
 
 
+@inlined
+def drawn_share(weight, full_weight):
+    """Return the share of the cases in which a sample of this weight is drawn."""
+    return weight / full_weight if weight < full_weight else np.float32(1.0)
+
+
+@bare
+def draw_samples(planes, volume, buffers, count, trans, g_rgb, g_background, gradients, peaks):
+    """Draw the samples of a ray whose gradients are computed, and have the processor fetch what these are added to.
+
+    buffers.drawn is set to them, from the last one to the first, and buffers.g_log_taus to the gradients of the
+    logarithms of their thicknesses, divided by `drawn_share`. The other parameters are those of `backpropagate_ray`.
+
+    Returns:
+        The number of samples drawn.
+    """
+    behind = g_background  # d loss / d C times the colour that comes from behind sample k
+    trans_after = trans  # transmittance after sample k
+    shares, drawn = first_draw(buffers, volume), 0
+    for k in range(count - 1, -1, -1):
+        weight, colour = buffers.weights[k], buffers.decoded[k]
+        g_weight = g_rgb[0] * colour[1] + g_rgb[1] * colour[2] + g_rgb[2] * colour[3] + buffers.g_weights[k]
+        g_log_tau = (trans_after * g_weight - behind) * buffers.taus[k]
+        if weight > LEAST_PEAK:
+            cell = cell_index(peaks, buffers.points[k, 4], buffers.points[k, 5], buffers.points[k, 6])
+            peaks[cell] = max(peaks[cell], weight)
+        behind += weight * g_weight
+        trans_after += weight
+        if is_unclipped(buffers, k):
+            gradients.density[-1] += g_log_tau
+        share = drawn_share(weight, gradients.full_weight)
+        shares += share
+        if shares < np.float32(1.0):
+            continue
+        shares -= np.float32(1.0)
+        fetch_texels(planes, gradients.theta, buffers, k)
+        buffers.drawn[drawn], buffers.g_log_taus[drawn] = k, g_log_tau / share
+        drawn += 1
+    return drawn
+
+
+@inlined
+def is_unclipped(buffers, k):
+    """Return whether the log density of sample k lies within its limits."""
+    return abs(buffers.log_densities[k]) < LIMIT
+
+
 @bare
 def backpropagate_ray(planes, volume, origin, direction, buffers, count, trans, g_rgb, g_background, gradients, peaks):
     """Add the gradients of one ray after `march_ray` and `shade_ray`, from its last sample to its first.
@@ -92,31 +139,12 @@ def backpropagate_ray(planes, volume, origin, direction, buffers, count, trans, 
     if gradients.wants_rays:
         gradients.rays[7], gradients.rays[8], gradients.rays[9] = g_rgb
     buffers.g_decoder[:] = np.float32(0.0)
-    behind = g_background  # d loss / d C times the colour that comes from behind sample k
-    trans_after = trans  # transmittance after sample k
-    drawn = first_draw(buffers, volume)
-    for k in range(count - 1, -1, -1):
-        weight, colour = buffers.weights[k], buffers.decoded[k]
-        g_weight = g_rgb[0] * colour[1] + g_rgb[1] * colour[2] + g_rgb[2] * colour[3] + buffers.g_weights[k]
-        g_log_tau = (trans_after * g_weight - behind) * buffers.taus[k]
-        g_log = g_log_tau
-        if buffers.log_densities[k] >= LIMIT or buffers.log_densities[k] <= -LIMIT:
-            g_log = np.float32(0.0)
-        if weight > LEAST_PEAK:
-            cell = cell_index(peaks, buffers.points[k, 4], buffers.points[k, 5], buffers.points[k, 6])
-            peaks[cell] = max(peaks[cell], weight)
-        behind += weight * g_weight
-        trans_after += weight
-        gradients.density[-1] += g_log
-        share = np.float32(1.0)
-        if weight < gradients.full_weight:
-            share = weight / gradients.full_weight
-        drawn += share
-        if drawn < np.float32(1.0):
-            continue
-        drawn -= np.float32(1.0)
-        factor = weight / share
-        g_log, g_log_tau = g_log / share, g_log_tau / share
+    drawn = draw_samples(planes, volume, buffers, count, trans, g_rgb, g_background, gradients, peaks)
+    for n in range(drawn):
+        k, g_log_tau = buffers.drawn[n], buffers.g_log_taus[n]
+        weight = buffers.weights[k]
+        factor = weight / drawn_share(weight, gradients.full_weight)
+        g_log = g_log_tau if is_unclipped(buffers, k) else np.float32(0.0)
         decoder_gradient(buffers, k, g_log, (factor * g_rgb[0], factor * g_rgb[1], factor * g_rgb[2]))
         wants_ray = gradients.wants_rays and weight > negligible  # as for colours: others hardly move a picture
         wants_point = wants_ray or gradients.wants_motion

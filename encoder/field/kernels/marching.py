@@ -13,8 +13,8 @@ from kpc.encoder.field.kernels.geometry import (
     ray_point,
     ray_span,
 )
-from kpc.encoder.field.kernels.planes import place_sample, sample_displaced
-from kpc.encoder.field.kernels.texels import POINT
+from kpc.encoder.field.kernels.planes import locate_sample, place_sample, sample_planes
+from kpc.encoder.field.kernels.texels import PLACES, POINT
 from kpc.encoder.field.kernels.vectors import WIDE, absorb, decode, dot, sigmoids
 from kpc.encoder.field.occupancy_grid import STRIDE, STRIDED
 from kpc.format.container.scene_layout import SAMPLE_LIMIT
@@ -43,6 +43,8 @@ def new_ray_buffers(planes, capacity):
     return RayBuffers(
         np.empty((capacity, S * 6 * M), np.float32),
         np.empty((capacity, S * M), np.float32),
+        np.empty((capacity * S, PLACES), np.int32),
+        np.empty((capacity * S, 4), np.float32),
         np.empty((1, 4), np.float32),
         np.empty((capacity, POINT), np.float32),
         np.empty(capacity, np.float32),
@@ -50,6 +52,8 @@ def new_ray_buffers(planes, capacity):
         np.empty(capacity, np.float32),
         np.empty(capacity, np.float32),
         np.empty((capacity, 4), np.float32),
+        np.empty(capacity, np.float32),
+        np.empty(capacity, np.int32),
         np.empty(capacity, np.float32),
         np.empty((1, S * M), np.float32),
         np.empty(4 * S * M, np.float32),
@@ -135,7 +139,9 @@ def march_ray(planes, density, basis, volume, rays, i, buffers):
         found, k = find_samples(volume, occupied, span, origin, direction, time, jitter, buffers, count, k)
         end = count + found
         for n in range(count, end):
-            sample_displaced(planes, buffers, n, buffers.features, n)
+            locate_sample(planes, buffers, n)
+        for n in range(count, end):
+            sample_planes(planes, buffers, n, buffers.features, n)
         for n in range(count, end):
             decode(buffers.decoder, buffers.features, n, buffers.features.shape[1], buffers.decoded)
             buffers.log_densities[n] = min(max(buffers.decoded[n, 0] + density[-1], -LIMIT), LIMIT)

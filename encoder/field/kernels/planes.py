@@ -3,7 +3,15 @@
 import numpy as np
 
 from kpc.encoder.field.kernels.compilation import inlined
-from kpc.encoder.field.kernels.texels import POINT, add_slopes, displace, sample_scale, scatter_scale
+from kpc.encoder.field.kernels.texels import (
+    POINT,
+    add_slopes,
+    displace,
+    fetch_scale,
+    locate_scale,
+    sample_scale,
+    scatter_scale,
+)
 
 
 @inlined
@@ -31,30 +39,6 @@ def find_local(planes, buffers, k, s):
 
 
 @inlined
-def sample_planes(planes, buffers, k, features, row):
-    """Sample every plane at buffers.points[k], and write the products over planes to a row of `features` (n, F).
-
-    Planes have two rows and columns at least. buffers.values[k, (6 s + c) M :][:M] is set to what plane c of scale s
-    holds there.
-    """
-    grid, M, scales = (planes.theta, planes.places, planes.intervals), planes.channels, planes.places.shape[0]
-    for s in range(scales):
-        values = buffers.values, (k * scales + s) * 6 * M
-        products = features, (row * scales + s) * M
-        point = buffers.points, POINT * k
-        if is_part(planes, s):
-            if not find_local(planes, buffers, k, s):
-                for m in range(M):
-                    features[row, s * M + m] = np.float32(0.0)
-                continue
-            point = buffers.local, 0
-        if is_moving(planes, s):
-            sample_scale(grid, s, point, M, 6, values, products)
-        else:
-            sample_scale(grid, s, point, M, 3, values, products)
-
-
-@inlined
 def place_sample(buffers, k, u, v, w, time):
     """Make a point (u, v, w) at a time sample k of the buffers, not yet displaced."""
     point = buffers.points[k]
@@ -63,11 +47,58 @@ def place_sample(buffers, k, u, v, w, time):
 
 
 @inlined
-def sample_displaced(planes, buffers, k, features, row):
-    """Displace sample k of the buffers, and sample every plane there: `sample_planes`."""
+def locate_sample(planes, buffers, k):
+    """Displace sample k of the buffers, find the texels around it, and have the processor fetch them.
+
+    Planes have two rows and columns at least. buffers.texels is -1 at a scale in whose area the sample does not lie.
+    """
     if planes.motion.shape[0] > 0:
         displace(planes.motion, buffers.points, k)
-    sample_planes(planes, buffers, k, features, row)
+    grid, scales = (planes.theta, planes.places, planes.intervals), planes.places.shape[0]
+    around = buffers.texels, buffers.shares, buffers.values
+    for s in range(scales):
+        sample, point = k * scales + s, (buffers.points, POINT * k)
+        if is_part(planes, s):
+            if not find_local(planes, buffers, k, s):
+                buffers.texels[sample, 0] = -1
+                continue
+            point = buffers.local, 0
+        locate_scale(grid, s, point, around, sample)
+    fetch_texels(planes, planes.theta, buffers, k)
+
+
+@inlined
+def fetch_texels(planes, numbers, buffers, k):
+    """Have the processor fetch the texels around a sample that was located, or their gradients: `numbers` (n,)."""
+    grid, scales = (numbers, planes.places, planes.intervals), planes.places.shape[0]
+    around = buffers.texels, buffers.shares, buffers.values
+    for s in range(scales):
+        sample = k * scales + s
+        if buffers.texels[sample, 0] < 0:
+            continue
+        if is_moving(planes, s):
+            fetch_scale(grid, s, around, sample, planes.channels, 6)
+        else:
+            fetch_scale(grid, s, around, sample, planes.channels, 3)
+
+
+@inlined
+def sample_planes(planes, buffers, k, features, row):
+    """Sample every plane at a sample that was located, and write the products over planes to a row of features (n, F).
+
+    buffers.values[k, (6 s + c) M :][:M] is set to what plane c of scale s holds there.
+    """
+    grid, M, scales = (planes.theta, planes.places, planes.intervals), planes.channels, planes.places.shape[0]
+    around = buffers.texels, buffers.shares, buffers.values
+    for s in range(scales):
+        sample, products = k * scales + s, (features, (row * scales + s) * M)
+        if buffers.texels[sample, 0] < 0:
+            for m in range(M):
+                features[row, s * M + m] = np.float32(0.0)
+        elif is_moving(planes, s):
+            sample_scale(grid, s, around, sample, M, 6, products)
+        else:
+            sample_scale(grid, s, around, sample, M, 3, products)
 
 
 @inlined
@@ -78,26 +109,23 @@ def scatter_planes(planes, g_theta, g_features, row, buffers, k, wants_point):
     """
     grid = planes.theta, planes.places, planes.intervals
     g_grid, M, scales = (g_theta, planes.places, planes.intervals), planes.channels, planes.places.shape[0]
+    around = buffers.texels, buffers.shares, buffers.values
     points, g_point, g_local = buffers.points, buffers.g_point, buffers.g_local
     if wants_point:
         g_point[:] = np.float32(0.0)
     for s in range(scales):
-        values = buffers.values, (k * scales + s) * 6 * M
-        g_products = g_features, (row * scales + s) * M
-        point = points, POINT * k
-        if is_part(planes, s):
-            if not find_local(planes, buffers, k, s):
-                continue
-            point = buffers.local, 0
+        sample, g_products = k * scales + s, (g_features, (row * scales + s) * M)
+        if buffers.texels[sample, 0] < 0:
+            continue
         g_local[:] = np.float32(0.0)
         if is_moving(planes, s):
-            scatter_scale(g_grid, s, point, M, 6, values, g_products)
+            scatter_scale(g_grid, s, around, sample, M, 6, g_products)
             if wants_point:
-                add_slopes(grid, s, point, M, 6, values, g_products, g_local)
+                add_slopes(grid, s, around, sample, M, 6, g_products, g_local)
         else:
-            scatter_scale(g_grid, s, point, M, 3, values, g_products)
+            scatter_scale(g_grid, s, around, sample, M, 3, g_products)
             if wants_point:
-                add_slopes(grid, s, point, M, 3, values, g_products, g_local)
+                add_slopes(grid, s, around, sample, M, 3, g_products, g_local)
         if wants_point:
             for axis in range(3):
                 g_point[axis] += planes.areas[s, 4 + axis] * g_local[axis]

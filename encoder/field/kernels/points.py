@@ -6,8 +6,9 @@ from numba import prange
 from kpc.encoder.field.kernels.compilation import parallel
 from kpc.encoder.field.kernels.marching import BLOCK, decode_density, new_ray_buffers
 from kpc.encoder.field.kernels.planes import (
+    locate_sample,
     place_sample,
-    sample_displaced,
+    sample_planes,
     scatter_planes,
 )
 from kpc.encoder.field.kernels.texels import add_displacement_slopes, displace_transpose
@@ -27,7 +28,9 @@ def log_densities(planes, density, points, times, workers):
                 i = first + k
                 place_sample(buffers, k, points[i, 0], points[i, 1], points[i, 2], times[i])
             for k in range(count):
-                sample_displaced(planes, buffers, k, buffers.features, k)
+                locate_sample(planes, buffers, k)
+            for k in range(count):
+                sample_planes(planes, buffers, k, buffers.features, k)
             for k in range(count):
                 out[first + k] = decode_density(buffers.features, k, density)
     return out
@@ -42,7 +45,8 @@ def features(planes, points, times, workers):
         buffers = new_ray_buffers(planes, 1)
         for i in range(worker * N // workers, (worker + 1) * N // workers):
             place_sample(buffers, 0, points[i, 0], points[i, 1], points[i, 2], times[i])
-            sample_displaced(planes, buffers, 0, out, i)
+            locate_sample(planes, buffers, 0)
+            sample_planes(planes, buffers, 0, out, i)
     return out
 
 
@@ -62,7 +66,8 @@ def scatter_features(planes, g_theta, g_motion, g_points, points, times, g):
         buffers = new_ray_buffers(planes, 1)
         for i in range(worker * N // workers, (worker + 1) * N // workers):
             place_sample(buffers, 0, points[i, 0], points[i, 1], points[i, 2], times[i])
-            sample_displaced(planes, buffers, 0, buffers.features, 0)
+            locate_sample(planes, buffers, 0)
+            sample_planes(planes, buffers, 0, buffers.features, 0)
             scatter_planes(planes, g_theta[worker], g, i, buffers, 0, wants_motion or wants_points)
             if wants_motion:
                 displace_transpose(g_motion[worker], buffers.points, 0, buffers.g_point)

@@ -1,7 +1,9 @@
 """The texels of planes and the nodes of a motion grid around a point, by vectors over channels.
 
-Each intrinsic does what a sample needs of one scale at once, so that the numbers of six planes stay in the processor's
-registers. A place is an array and a position in it, which counts its numbers from the beginning: (array, int64).
+Texels are found, then fetched, and read when those of other samples have been found, too: most are not in the
+processor's nearest cache, and it would wait for them. Each intrinsic does what a sample needs of one scale at once, so
+that the numbers of six planes stay in the processor's registers. A place is an array and a position in it, which counts
+its numbers from the beginning: (array, int64).
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,7 +14,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from kpc.encoder.field.kernels.vectors import WIDE
+from kpc.encoder.field.kernels.vectors import WIDTHS
 from kpc.vectors import (
     FLOAT,
     INDEX,
@@ -26,6 +28,7 @@ from kpc.vectors import (
     for_each_vector,
     load,
     picked,
+    prefetch,
     product,
     spread,
     store,
@@ -35,8 +38,11 @@ from kpc.vectors import (
 # The axes of the planes xy xz yz xt yt zt along their columns and rows, as positions in "xyzt".
 AXES = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
 
-# Columns of each half of `PlaneSet.places`.
+# Columns of each half of `PlaneSet.places`, and of `RayBuffers.texels` for each scale.
 PLACES = 8
+
+# Numbers of a line of the processor's cache.
+LINE = 16
 
 # Columns of `RayBuffers.points`, and where the point before displacement begins in a row.
 POINT, UNDISPLACED = 8, 4
@@ -57,34 +63,26 @@ def _texel_and_share(builder: Any, point: Any, interval: Any) -> tuple[Any, Any]
 
 
 class _Scale:
-    """What the intrinsics of one scale have in common, unpacked from their first seven arguments.
+    """What the intrinsics of one scale have in common, unpacked from their first six arguments.
 
     Attributes:
         texels: for each plane, pointers to the four texels around the point.
         shares: float32, along x, y, z, t, of the way to the next texel.
-        intervals: four float32, between texels along each axis.
         channels: M.
     """
 
     def __init__(self, context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> None:
-        grid, number, point, self.channels, _, values, features = arguments[:7]
+        grid, number, around, sample, self.channels, _ = arguments[:6]
         self.builder = builder
-        of_grid, _, of_point, _, planes, of_values, of_features = signature.args[:7]
-        data, places, intervals = (
-            array_data(context, builder, kind, array)
-            for kind, array in zip(of_grid, cgutils.unpack_tuple(builder, grid), strict=True)
-        )
-        point, self._values, self._features = (
-            _place(context, builder, kind, place)
-            for kind, place in ((of_point, point), (of_values, values), (of_features, features))
-        )
-        self.intervals = load(builder, intervals, builder.mul(number, INDEX(4)), 4)
-        texel, share = _texel_and_share(builder, load(builder, point, INDEX(0), 4), self.intervals)
+        of_grid, _, of_around, _, _, planes = signature.args[:6]
+        data, places, self._intervals = _unpacked(context, builder, of_grid, grid)
+        texels, shares, values = _unpacked(context, builder, of_around, around)
+        self._number = number
+        self._values = builder.gep(values, [builder.mul(sample, builder.mul(self.channels, INDEX(len(AXES))))])
+        share = load(builder, shares, builder.mul(sample, INDEX(4)), 4)
         self.shares = [builder.extract_element(share, LANE(axis)) for axis in range(4)]
-        at = builder.mul(number, INDEX(2 * PLACES))
-        first, per_row = (load(builder, places, builder.add(at, INDEX(n)), PLACES, LANE) for n in (0, PLACES))
-        column, row = (picked(builder, texel, texel, [axes[n] for axes in AXES] + [0, 0]) for n in (0, 1))
-        first = builder.add(first, builder.add(builder.mul(row, per_row), column))
+        first = load(builder, texels, builder.mul(sample, INDEX(PLACES)), PLACES, LANE)
+        per_row = load(builder, places, _of_rows(builder, number), PLACES, LANE)
         self.texels = []
         for c in range(planes.literal_value):
             start, below = (
@@ -94,6 +92,10 @@ class _Scale:
             rows = start, builder.add(start, below)
             places = [place for row in rows for place in (row, builder.add(row, self.channels))]
             self.texels.append([builder.gep(data, [place]) for place in places])
+
+    def intervals(self) -> Any:
+        """Return four float32, between texels along each axis."""
+        return load(self.builder, self._intervals, self.builder.mul(self._number, INDEX(4)), 4)
 
     def planes(self, m: Any, wide: int) -> Iterator[tuple[list[Any], Any, Any]]:
         """Yield, for each plane, pointers to its texels from channel m on, and the shares along columns and rows."""
@@ -105,15 +107,11 @@ class _Scale:
         """Return a pointer to channel m of what plane c holds at the point."""
         return self.builder.gep(self._values, [self.builder.add(self.builder.mul(self.channels, INDEX(c)), m)])
 
-    def feature(self, m: Any) -> Any:
-        """Return a pointer to channel m of the product over planes, or of its gradient."""
-        return self.builder.gep(self._features, [m])
-
-    def gradients(self, m: Any, wide: int) -> list[Any]:
-        """Return the gradient of channel m of what each plane holds at the point."""
+    def gradients(self, feature: Any, m: Any, wide: int) -> list[Any]:
+        """Return the gradient of channel m of what each plane holds at the point, given that of the product."""
         builder = self.builder
         values = [load(builder, self.value(c, m), INDEX(0), wide) for c in range(len(self.texels))]
-        before = [load(builder, self.feature(m), INDEX(0), wide)]  # times the values of the planes before
+        before = [load(builder, feature, m, wide)]  # times the values of the planes before
         for value in values[:-1]:
             before.append(product(builder, before[-1], value))
         gradients, behind = [before[-1]], values[-1]  # product of the values of the planes behind
@@ -123,10 +121,25 @@ class _Scale:
         return gradients[::-1]
 
 
-def _signature(grid: Any, point: Any, planes: Any, values: Any, features: Any, *more: Any) -> Any:
+def _unpacked(context: Any, builder: Any, kinds: Any, arrays: Any) -> list[Any]:
+    """Return pointers to the first number of each of a tuple of arrays."""
+    members = cgutils.unpack_tuple(builder, arrays)
+    return [array_data(context, builder, kind, array) for kind, array in zip(kinds, members, strict=True)]
+
+
+def _of_rows(builder: Any, scale: Any) -> Any:
+    """Return where in `PlaneSet.places` the texels in a row of each plane of a scale are."""
+    return builder.add(builder.mul(scale, INDEX(2 * PLACES)), INDEX(PLACES))
+
+
+def _place_type(place: Any) -> Any:
+    """Return the type of a place, given that of an argument."""
+    return types.Tuple((place[0], types.int64))
+
+
+def _signature(grid: Any, around: Any, planes: Any, *more: Any) -> Any:
     """Return the types of what `_Scale` unpacks, given those of the arguments, and of `more` after it."""
-    point, values, features = (types.Tuple((place[0], types.int64)) for place in (point, values, features))
-    return types.void(grid, types.int64, point, types.int64, planes, values, features, *more)
+    return types.void(grid, types.int64, around, types.int64, types.int64, planes, *more)
 
 
 def _place(context: Any, builder: Any, kind: Any, value: Any) -> Any:
@@ -140,25 +153,75 @@ def _between(builder: Any, a: Any, b: Any, share: Any) -> Any:
     return added(builder, a, product(builder, share, builder.fsub(b, a)))
 
 
-@intrinsic(prefer_literal=True)
-def sample_scale(
-    _: Any, grid: Any, scale: Any, point: Any, channels: Any, planes: Any, values: Any, features: Any
-) -> Any:
-    """Sample the planes of one scale at a point, and multiply what they hold.
+@intrinsic
+def locate_scale(_: Any, grid: Any, scale: Any, point: Any, around: Any, sample: Any) -> Any:
+    """Find the texels around a point in the planes of one scale.
 
-    values[c M + m] is set to channel m of plane c, and features[m] to the product over planes.
+    texels[PLACES sample + c] is set to the first texel of plane c around the point, and shares[4 sample + axis] to the
+    share of the way to the next along x, y, z, t.
 
     Args:
-        grid: theta, `PlaneSet.places` and `PlaneSet.intervals`.
+        grid: theta or its gradient, `PlaneSet.places` and `PlaneSet.intervals`.
         scale: int64.
         point: place of u, v, w and the time, each in [0, 1] or clamped to it.
+        around: texels, shares and values of `RayBuffers`.
+        sample: int64, number of the sample times the number of scales, plus the scale.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        grid, number, point, around, sample = arguments
+        _, places, intervals = _unpacked(context, builder, signature.args[0], grid)
+        texels, shares, _ = _unpacked(context, builder, signature.args[3], around)
+        point = load(builder, _place(context, builder, signature.args[2], point), INDEX(0), 4)
+        texel, share = _texel_and_share(builder, point, load(builder, intervals, builder.mul(number, INDEX(4)), 4))
+        first = load(builder, places, builder.mul(number, INDEX(2 * PLACES)), PLACES, LANE)
+        per_row = load(builder, places, _of_rows(builder, number), PLACES, LANE)
+        column, row = (picked(builder, texel, texel, [axes[n] for axes in AXES] + [0, 0]) for n in (0, 1))
+        first = builder.add(first, builder.add(builder.mul(row, per_row), column))
+        store(builder, first, texels, builder.mul(sample, INDEX(PLACES)))
+        store(builder, share, shares, builder.mul(sample, INDEX(4)))
+        return context.get_dummy_value()
+
+    return types.void(grid, types.int64, _place_type(point), around, types.int64), generate
+
+
+@intrinsic(prefer_literal=True)
+def fetch_scale(_: Any, grid: Any, scale: Any, around: Any, sample: Any, channels: Any, planes: Any) -> Any:
+    """Have the processor fetch the texels that `locate_scale` found, before they are needed.
+
+    Args:
+        grid, scale, around, sample: as of `locate_scale`.
         channels: int64, M.
         planes: 6, or 3 in a static scene; a constant.
-        values, features: places.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
         at = _Scale(context, builder, signature, arguments)
+        with cgutils.for_range_slice(builder, INDEX(0), at.channels, INDEX(LINE), inc=True) as (m, _):
+            for texels in at.texels:
+                for texel in texels:
+                    prefetch(builder, builder.gep(texel, [m]))
+        return context.get_dummy_value()
+
+    return _signature(grid, around, planes), generate
+
+
+@intrinsic(prefer_literal=True)
+def sample_scale(
+    _: Any, grid: Any, scale: Any, around: Any, sample: Any, channels: Any, planes: Any, features: Any
+) -> Any:
+    """Sample the planes of one scale around a point, and multiply what they hold.
+
+    values[(6 sample + c) M + m] is set to channel m of plane c, and features[m] to the product over planes.
+
+    Args:
+        grid, scale, around, sample, channels, planes: as of `fetch_scale`.
+        features: place of M numbers.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        at = _Scale(context, builder, signature, arguments)
+        features = _place(context, builder, signature.args[6], arguments[6])
 
         def emit(m: Any, wide: int) -> None:
             held = []
@@ -167,31 +230,32 @@ def sample_scale(
                 held.append(_between(builder, _between(builder, a, b, fc), _between(builder, c, d, fc), fr))
             for n, value in enumerate(held):
                 store(builder, value, at.value(n, m), INDEX(0))
-            store(builder, product(builder, *held), at.feature(m), INDEX(0))
+            store(builder, product(builder, *held), features, m)
 
-        for_each_vector(builder, at.channels, WIDE, emit)
+        for_each_vector(builder, at.channels, WIDTHS, emit)
         return context.get_dummy_value()
 
-    return _signature(grid, point, planes, values, features), generate
+    return _signature(grid, around, planes, _place_type(features)), generate
 
 
 @intrinsic(prefer_literal=True)
 def scatter_scale(
-    _: Any, grid: Any, scale: Any, point: Any, channels: Any, planes: Any, values: Any, g_features: Any
+    _: Any, grid: Any, scale: Any, around: Any, sample: Any, channels: Any, planes: Any, g_features: Any
 ) -> Any:
     """Add the gradient of the planes of one scale, given that of the product over planes: `sample_scale`'s transpose.
 
     Args:
         grid: the gradient of theta, `PlaneSet.places` and `PlaneSet.intervals`.
-        scale, point, channels, planes, values: as of `sample_scale`.
+        scale, around, sample, channels, planes: as of `sample_scale`.
         g_features: place of M numbers.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
         at = _Scale(context, builder, signature, arguments)
+        g_features = _place(context, builder, signature.args[6], arguments[6])
 
         def emit(m: Any, wide: int) -> None:
-            for gradient, (texels, fc, fr) in zip(at.gradients(m, wide), at.planes(m, wide), strict=True):
+            for gradient, (texels, fc, fr) in zip(at.gradients(g_features, m, wide), at.planes(m, wide), strict=True):
                 lower = product(builder, fr, gradient)
                 parts = []
                 for row in (builder.fsub(gradient, lower), lower):
@@ -201,15 +265,15 @@ def scatter_scale(
                 for texel, number, part in zip(texels, held, parts, strict=True):
                     store(builder, added(builder, number, part), texel, INDEX(0))
 
-        for_each_vector(builder, at.channels, WIDE, emit)
+        for_each_vector(builder, at.channels, WIDTHS, emit)
         return context.get_dummy_value()
 
-    return _signature(grid, point, planes, values, g_features), generate
+    return _signature(grid, around, planes, _place_type(g_features)), generate
 
 
 @intrinsic(prefer_literal=True)
 def add_slopes(
-    _: Any, grid: Any, scale: Any, point: Any, channels: Any, planes: Any, values: Any, g_features: Any, g_point: Any
+    _: Any, grid: Any, scale: Any, around: Any, sample: Any, channels: Any, planes: Any, g_features: Any, g_point: Any
 ) -> Any:
     """Add the gradient of the point's coordinates by way of one scale to g_point (4,).
 
@@ -218,11 +282,12 @@ def add_slopes(
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
         at = _Scale(context, builder, signature, arguments)
+        g_features = _place(context, builder, signature.args[6], arguments[6])
         g_point = array_of(context, builder, signature, arguments, 7).data
 
         def emit(m: Any, wide: int) -> None:
             slopes = [constant(0.0, wide)] * 4
-            planes = zip(at.gradients(m, wide), at.planes(m, wide), AXES, strict=False)
+            planes = zip(at.gradients(g_features, m, wide), at.planes(m, wide), AXES, strict=False)
             for gradient, (texels, fc, fr), (column_axis, row_axis) in planes:
                 a, b, c, d = (load(builder, texel, INDEX(0), wide) for texel in texels)
                 along = _between(builder, builder.fsub(b, a), builder.fsub(d, c), fr)
@@ -234,12 +299,12 @@ def add_slopes(
                 number = builder.extract_element(folded(builder, slope, wide, 1), LANE(0))
                 total = builder.insert_element(total, number, LANE(axis))
             held = load(builder, g_point, INDEX(0), 4)
-            store(builder, added(builder, held, product(builder, at.intervals, total)), g_point, INDEX(0))
+            store(builder, added(builder, held, product(builder, at.intervals(), total)), g_point, INDEX(0))
 
-        for_each_vector(builder, at.channels, WIDE, emit)
+        for_each_vector(builder, at.channels, WIDTHS, emit)
         return context.get_dummy_value()
 
-    return _signature(grid, point, planes, values, g_features, g_point), generate
+    return _signature(grid, around, planes, _place_type(g_features), g_point), generate
 
 
 class _MotionCell:

@@ -22,15 +22,19 @@ from kpc.vectors import (
     folded,
     for_each_vector,
     load,
+    padded,
     product,
     spread,
     store,
     sums,
-    vector_type,
 )
 
-# Numbers of a vector.
+# Numbers of a vector where as many as there are samples in a block are computed at once.
 WIDE = 8
+
+# Numbers of the vectors of loops over channels or features.
+WIDTHS = 16, 8, 1
+WIDEST = WIDTHS[0]
 
 _FOUR = types.UniTuple(types.float32, 4)
 
@@ -47,23 +51,16 @@ def decode(_: Any, decoder: Any, features: Any, row: Any, count: Any, out: Any) 
         _, _, row, count, _ = arguments
         decoder, features, out = (array_of(context, builder, signature, arguments, n).data for n in (0, 1, 4))
         starts = [builder.mul(count, INDEX(c)) for c in range(4)]
-        totals = {wide: [cgutils.alloca_once(builder, vector_type(wide)) for _ in starts] for wide in (WIDE, 1)}
-        for wide, four in totals.items():
-            for total in four:
-                builder.store(constant(0.0, wide), total)
+        totals = [cgutils.alloca_once_value(builder, constant(0.0, WIDEST)) for _ in starts]
 
         def emit(i: Any, wide: int) -> None:
             feature = load(builder, features, builder.add(builder.mul(row, count), i), wide)
-            for total, start in zip(totals[wide], starts, strict=True):
+            for total, start in zip(totals, starts, strict=True):
                 term = product(builder, feature, load(builder, decoder, builder.add(start, i), wide))
-                builder.store(added(builder, builder.load(total), term), total)
+                builder.store(added(builder, builder.load(total), padded(builder, term, wide, WIDEST)), total)
 
-        for_each_vector(builder, count, WIDE, emit)
-        whole = sums(builder, [builder.load(total) for total in totals[WIDE]], WIDE)
-        for c, total in enumerate(totals[1]):
-            rest = builder.extract_element(builder.load(total), LANE(0))
-            number = builder.extract_element(whole, LANE(c))
-            whole = builder.insert_element(whole, builder.fadd(number, rest), LANE(c))
+        for_each_vector(builder, count, WIDTHS, emit)
+        whole = sums(builder, [builder.load(total) for total in totals], WIDEST)
         store(builder, whole, out, builder.mul(row, INDEX(4)))
         return context.get_dummy_value()
 
@@ -91,7 +88,7 @@ def decode_transpose(_: Any, decoder: Any, g: Any, count: Any, g_features: Any) 
                 terms.append(product(builder, spread(builder, number, wide), weights))
             store(builder, added(builder, *terms), g_features, i)
 
-        for_each_vector(builder, count, WIDE, emit)
+        for_each_vector(builder, count, WIDTHS, emit)
         return context.get_dummy_value()
 
     return types.void(decoder, _FOUR, types.int64, g_features), generate
@@ -117,7 +114,7 @@ def add_decoder_gradient(_: Any, g_decoder: Any, g: Any, count: Any, features: A
                 term = product(builder, spread(builder, number, wide), feature)
                 store(builder, added(builder, load(builder, g_decoder, place, wide), term), g_decoder, place)
 
-        for_each_vector(builder, count, WIDE, emit)
+        for_each_vector(builder, count, WIDTHS, emit)
         return context.get_dummy_value()
 
     whole = types.int64
@@ -162,17 +159,14 @@ def dot(_: Any, a: Any, at: Any, b: Any, b_at: Any, count: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
         _, at, _, b_at, count = arguments
         a, b = (array_of(context, builder, signature, arguments, n).data for n in (0, 2))
-        sums = {wide: cgutils.alloca_once(builder, constant(0.0, wide).type) for wide in (WIDE, 1)}
-        for wide, place in sums.items():
-            builder.store(constant(0.0, wide), place)
+        total = cgutils.alloca_once_value(builder, constant(0.0, WIDEST))
 
         def add(i: Any, wide: int) -> None:
             term = product(builder, *(load(builder, x, builder.add(s, i), wide) for x, s in ((a, at), (b, b_at))))
-            builder.store(added(builder, builder.load(sums[wide]), term), sums[wide])
+            builder.store(added(builder, builder.load(total), padded(builder, term, wide, WIDEST)), total)
 
-        for_each_vector(builder, count, WIDE, add)
-        total = added(builder, folded(builder, builder.load(sums[WIDE]), WIDE, 1), builder.load(sums[1]))
-        return builder.extract_element(total, LANE(0))
+        for_each_vector(builder, count, WIDTHS, add)
+        return builder.extract_element(folded(builder, builder.load(total), WIDEST, 1), LANE(0))
 
     whole = types.int64
     return types.float32(a, whole, b, whole, whole), generate
