@@ -31,8 +31,8 @@ def plane_set(
         motion = np.zeros((0, 1, 1, 1, 3), np.float32)
     table, held = layout.table[:scales], layout.held[:scales]
     places = np.zeros((len(table), 2, kernels.PLACES), np.int32)
-    places[:, 0, : len(kernels.AXES)] = np.maximum(table, 0) // layout.channels
-    places[:, 1, : len(kernels.AXES)] = held[:, [column_axis for column_axis, _ in kernels.AXES]]
+    places[:, 0, : len(kernels.AXES)] = np.maximum(table, 0)
+    places[:, 1, : len(kernels.AXES)] = held[:, [column_axis for column_axis, _ in kernels.AXES]] * layout.channels
     intervals = (held - 1).astype(np.float32)
     areas = layout.areas[:scales].reshape(len(table), -1)
     return kernels.PlaneSet(theta, places.reshape(len(table), -1), intervals, layout.channels, areas, motion)

@@ -73,7 +73,7 @@ def prefetch(builder: Any, place: Any) -> None:
 
 def spread(builder: Any, value: Any, count: int) -> Any:
     """Return a vector of `count` times one number."""
-    vector = builder.insert_element(ir.Constant(vector_type(count), ir.Undefined), value, LANE(0))
+    vector = builder.insert_element(ir.Constant(vector_type(count, value.type), ir.Undefined), value, LANE(0))
     return picked(builder, vector, vector, [0] * count)
 
 

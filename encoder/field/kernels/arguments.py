@@ -16,7 +16,7 @@ class PlaneSet(NamedTuple):
     """The planes of a field, and its motion grid."""
 
     theta: np.ndarray  # (n,) float32, all planes one after the other, each (rows, columns, M)
-    places: np.ndarray  # (S, 16) int32: of xy xz yz xt yt zt first texel in theta [0:6], texels in a row [8:14]
+    places: np.ndarray  # (S, 16) int32: of xy xz yz xt yt zt where in theta they begin [0:6], numbers in a row [8:14]
     intervals: np.ndarray  # (S, 4) float32, between texels along x, y, z and t; -1 without planes in space and time
     channels: int  # M
     areas: np.ndarray  # (S, 8) float32, `kpc.encoder.field.layout.Layout.areas`
@@ -70,7 +70,7 @@ class RayBuffers(NamedTuple):
 
     values: np.ndarray  # (K, S * 6 * M) float32, what each plane holds at a sample
     features: np.ndarray  # (K, F) float32
-    texels: np.ndarray  # (K * S, PLACES) int32, of each plane the first texel around a sample; -1: outside of the area
+    texels: np.ndarray  # (K * S, PLACES) int32, where the first texel of each plane begins; -1: outside of the area
     shares: np.ndarray  # (K * S, 4) float32, of the way to the next texel along x, y, z and t
     local: np.ndarray  # (1, 4) float32: u in the area of a scale, and time, of the current sample
     points: np.ndarray  # (K, POINT) float32: u displaced, time, u before displacement, time

@@ -63,7 +63,7 @@ def locate_sample(planes, buffers, k):
                 buffers.texels[sample, 0] = -1
                 continue
             point = buffers.local, 0
-        locate_scale(grid, s, point, around, sample)
+        locate_scale(grid, s, point, planes.channels, around, sample)
     fetch_texels(planes, planes.theta, buffers, k)
 
 

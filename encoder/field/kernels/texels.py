@@ -79,19 +79,17 @@ class _Scale:
         texels, shares, values = _unpacked(context, builder, of_around, around)
         self._number = number
         self._values = builder.gep(values, [builder.mul(sample, builder.mul(self.channels, INDEX(len(AXES))))])
-        share = load(builder, shares, builder.mul(sample, INDEX(4)), 4)
-        self.shares = [builder.extract_element(share, LANE(axis)) for axis in range(4)]
-        first = load(builder, texels, builder.mul(sample, INDEX(PLACES)), PLACES, LANE)
-        per_row = load(builder, places, _of_rows(builder, number), PLACES, LANE)
+        at = builder.mul(sample, INDEX(4))
+        self.shares = [builder.load(builder.gep(shares, [builder.add(at, INDEX(axis))])) for axis in range(4)]
         self.texels = []
         for c in range(planes.literal_value):
             start, below = (
-                builder.mul(builder.sext(builder.extract_element(vector, LANE(c)), INDEX), self.channels)
-                for vector in (first, per_row)
+                builder.sext(builder.load(builder.gep(whole, [builder.add(at, INDEX(c))])), INDEX)
+                for whole, at in ((texels, builder.mul(sample, INDEX(PLACES))), (places, _of_rows(builder, number)))
             )
             rows = start, builder.add(start, below)
-            places = [place for row in rows for place in (row, builder.add(row, self.channels))]
-            self.texels.append([builder.gep(data, [place]) for place in places])
+            ends = [end for row in rows for end in (row, builder.add(row, self.channels))]
+            self.texels.append([builder.gep(data, [end]) for end in ends])
 
     def intervals(self) -> Any:
         """Return four float32, between texels along each axis."""
@@ -128,7 +126,7 @@ def _unpacked(context: Any, builder: Any, kinds: Any, arrays: Any) -> list[Any]:
 
 
 def _of_rows(builder: Any, scale: Any) -> Any:
-    """Return where in `PlaneSet.places` the texels in a row of each plane of a scale are."""
+    """Return where in `PlaneSet.places` the numbers in a row of each plane of a scale are."""
     return builder.add(builder.mul(scale, INDEX(2 * PLACES)), INDEX(PLACES))
 
 
@@ -154,35 +152,38 @@ def _between(builder: Any, a: Any, b: Any, share: Any) -> Any:
 
 
 @intrinsic
-def locate_scale(_: Any, grid: Any, scale: Any, point: Any, around: Any, sample: Any) -> Any:
+def locate_scale(_: Any, grid: Any, scale: Any, point: Any, channels: Any, around: Any, sample: Any) -> Any:
     """Find the texels around a point in the planes of one scale.
 
-    texels[PLACES sample + c] is set to the first texel of plane c around the point, and shares[4 sample + axis] to the
-    share of the way to the next along x, y, z, t.
+    texels[PLACES sample + c] is set to where in theta the first texel of plane c around the point begins, and
+    shares[4 sample + axis] to the share of the way to the next along x, y, z, t.
 
     Args:
         grid: theta or its gradient, `PlaneSet.places` and `PlaneSet.intervals`.
         scale: int64.
         point: place of u, v, w and the time, each in [0, 1] or clamped to it.
+        channels: int64, M.
         around: texels, shares and values of `RayBuffers`.
         sample: int64, number of the sample times the number of scales, plus the scale.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        grid, number, point, around, sample = arguments
+        grid, number, point, channels, around, sample = arguments
         _, places, intervals = _unpacked(context, builder, signature.args[0], grid)
-        texels, shares, _ = _unpacked(context, builder, signature.args[3], around)
+        texels, shares, _ = _unpacked(context, builder, signature.args[4], around)
         point = load(builder, _place(context, builder, signature.args[2], point), INDEX(0), 4)
         texel, share = _texel_and_share(builder, point, load(builder, intervals, builder.mul(number, INDEX(4)), 4))
         first = load(builder, places, builder.mul(number, INDEX(2 * PLACES)), PLACES, LANE)
         per_row = load(builder, places, _of_rows(builder, number), PLACES, LANE)
         column, row = (picked(builder, texel, texel, [axes[n] for axes in AXES] + [0, 0]) for n in (0, 1))
-        first = builder.add(first, builder.add(builder.mul(row, per_row), column))
+        wide = spread(builder, builder.trunc(channels, LANE), PLACES)
+        for step, size in ((row, per_row), (column, wide)):
+            first = builder.add(first, builder.mul(step, size))
         store(builder, first, texels, builder.mul(sample, INDEX(PLACES)))
         store(builder, share, shares, builder.mul(sample, INDEX(4)))
         return context.get_dummy_value()
 
-    return types.void(grid, types.int64, _place_type(point), around, types.int64), generate
+    return types.void(grid, types.int64, _place_type(point), types.int64, around, types.int64), generate
 
 
 @intrinsic(prefer_literal=True)
@@ -190,8 +191,7 @@ def fetch_scale(_: Any, grid: Any, scale: Any, around: Any, sample: Any, channel
     """Have the processor fetch the texels that `locate_scale` found, before they are needed.
 
     Args:
-        grid, scale, around, sample: as of `locate_scale`.
-        channels: int64, M.
+        grid, scale, around, sample, channels: as of `locate_scale`.
         planes: 6, or 3 in a static scene; a constant.
     """
 
@@ -313,6 +313,7 @@ class _MotionCell:
     Attributes:
         nodes: pointers to the 16 nodes, and of each its factors along x, y, z, t, whose product is its weight, and
             whether it is the further one along each.
+        shares: float32, along x, y, z, t, of the way to the next node.
         intervals: four float32, between nodes along each axis.
     """
 
@@ -325,11 +326,12 @@ class _MotionCell:
             interval = builder.insert_element(interval, number, LANE(axis))
         at = builder.add(builder.mul(row, INDEX(POINT)), INDEX(UNDISPLACED))
         texel, share = _texel_and_share(builder, load(builder, points, at, 4), interval)
+        self.shares = [builder.extract_element(share, LANE(axis)) for axis in range(4)]
         stride = INDEX(3)
         nodes: list[tuple[Any, tuple[Any, ...], tuple[bool, ...]]] = [(INDEX(0), (), ())]
         for axis, size in enumerate(sizes):
             lower = builder.mul(builder.sext(builder.extract_element(texel, LANE(axis)), INDEX), stride)
-            on = builder.extract_element(share, LANE(axis))
+            on = self.shares[axis]
             ways = (lower, builder.fsub(_ONE, on), False), (builder.add(lower, stride), on, True)
             nodes = [
                 (builder.add(node, step), (*factors, factor), (*further, is_further))
@@ -356,10 +358,13 @@ def displace(_: Any, motion: Any, points: Any, k: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
         motion, points = (array_of(context, builder, signature, arguments, n) for n in range(2))
         at = builder.mul(arguments[2], INDEX(POINT))
-        terms = [load(builder, points.data, builder.add(at, INDEX(UNDISPLACED)), 3)]
-        for node, weight in _MotionCell(builder, motion, points.data, arguments[2]).weighted():
-            terms.append(product(builder, weight, load(builder, node, INDEX(0), 3)))
-        store(builder, added(builder, *terms), points.data, at)
+        cell = _MotionCell(builder, motion, points.data, arguments[2])
+        held = [load(builder, node, INDEX(0), 3) for node, *_ in cell.nodes]
+        for share in reversed(cell.shares):  # nodes beside each other along the last axis follow each other
+            on = spread(builder, share, 3)
+            held = [_between(builder, *pair, on) for pair in zip(held[::2], held[1::2], strict=True)]
+        undisplaced = load(builder, points.data, builder.add(at, INDEX(UNDISPLACED)), 3)
+        store(builder, added(builder, undisplaced, *held), points.data, at)
         return context.get_dummy_value()
 
     return types.void(motion, points, types.int64), generate
