@@ -21,6 +21,9 @@ CONFIRMED = 0.65
 FEW_POINTS = 100
 # Cameras of a rig are at one place if they are nearer than this share of its extent.
 ONE_PLACE = 0.005
+# Degrees across the width of a picture beyond which a pinhole is doubtful: 9 mm on a full frame, the widest lens that
+# is sold, have 127.
+WIDEST_PINHOLE = 130.0
 # A moving camera jumps if it moves so many times as far as is usual around that frame, and by this share of its path's
 # extent; so many frames before and after are looked at.
 JUMP, JUMP_EXTENT, AROUND = 12.0, 0.03, 15
@@ -51,6 +54,15 @@ def doubts(kind: str, names: Sequence[str], structure: Structure) -> list[str]:
         )
     if apart:
         found.append(f"{first_names(apart)} fit each other but not the rest; film what connects them")
+    wide = {view: angle for view, angle in _pinhole_angles(structure).items() if angle > WIDEST_PINHOLE}
+    if wide:
+        angle = max(wide.values())
+        shown = by_camera(names, wide) if kind == "moving cameras" else [names[view] for view in wide]
+        found.append(
+            f"{first_names(shown)} would have a pinhole lens of {angle:.0f} degrees across, wider than any that is "
+            "sold; if some lenses are fisheyes and others are not, place those of one kind alone, else try --lens "
+            "fisheye"
+        )
     points = sorted(view.points for view in structure.views.values())
     if points[len(points) // 2] < FEW_POINTS:
         found.append(
@@ -79,6 +91,15 @@ def confirmed_shares(structure: Structure) -> dict[int, float]:
                 total[0] += pair.agreeing * pair.confirmed
                 total[1] += pair.agreeing
     return {view: agreeing / total for view, (agreeing, total) in sorted(counts.items())}
+
+
+def _pinhole_angles(structure: Structure) -> dict[int, float]:
+    """Return by view how many degrees across the width of its picture are; of those without a fisheye."""
+    return {
+        number: float(2 * np.degrees(np.arctan2(view.intrinsics[2], view.intrinsics[0])))
+        for number, view in sorted(structure.views.items())
+        if not view.is_fisheye
+    }
 
 
 def _at_one_place(structure: Structure) -> list[tuple[int, int]]:

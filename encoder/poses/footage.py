@@ -18,6 +18,8 @@ from kpc.format.common.media_files import is_hidden, is_image, is_video
 LEAST_FRAMES = 5
 # How the names of folders end into which `kpposes` writes frames; a number follows where there are several.
 FRAMES = ".images"
+# Names of folders that hold masks, in small letters; only those in `masks` are used.
+MASK_FOLDERS = ("masks", "mask")
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,17 @@ def find_footage(root: Path) -> tuple[Footage, ...]:
 
 
 def left_out(root: Path, footage: Iterable[Footage]) -> list[str]:
-    """Return the names of images and videos in a folder, or in its folders, that belong to no camera."""
+    """Return the names of images and videos in a folder, or in its folders, that belong to no camera.
+
+    Masks do not count, nor do frames that `kpposes` wrote beside a document that is still there.
+    """
     used = {file for one in footage for file in one.files}
-    found = [file for folder in (root, *_folders(root)) for file in media_in(folder)]
+    folders = [
+        folder
+        for folder in root.iterdir()
+        if folder.is_dir() and not is_hidden(folder) and folder.name != MASKS and not _has_document(folder)
+    ]
+    found = [file for folder in (root, *folders) for file in media_in(folder)]
     return sorted(
         (
             file.relative_to(root).as_posix()
@@ -68,6 +78,12 @@ def left_out(root: Path, footage: Iterable[Footage]) -> list[str]:
         ),
         key=natural_key,
     )
+
+
+def _has_document(folder: Path) -> bool:
+    """Return whether `kpposes` wrote the frames in a folder, to go by its name and that of a document beside it."""
+    name = re.fullmatch(rf"(.+){re.escape(FRAMES)}(-\d+)?", folder.name)
+    return name is not None and folder.with_name(f"{name[1]}.json").is_file()
 
 
 def frame_size(footage: Footage) -> tuple[int, int]:
@@ -115,12 +131,6 @@ def _images_in(folder: Path) -> list[Path]:
 
 
 def _folders(root: Path) -> list[Path]:
-    """Return the folders in a folder that may hold footage: neither masks nor frames that `kpposes` has written."""
-    return sorted(
-        folder
-        for folder in root.iterdir()
-        if folder.is_dir()
-        and not is_hidden(folder)
-        and folder.name != MASKS
-        and not re.fullmatch(rf".+{re.escape(FRAMES)}(-\d+)?", folder.name)
-    )
+    """Return the folders in a folder that may hold footage: not those of masks."""
+    folders = sorted(folder for folder in root.iterdir() if folder.is_dir() and not is_hidden(folder))
+    return [folder for folder in folders if folder.name.lower() not in MASK_FOLDERS]

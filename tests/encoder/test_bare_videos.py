@@ -302,21 +302,32 @@ def test_of_a_mixture_it_is_said_what_is_left_out(tmp_path, capsys):
         film(tmp_path / name)
     (tmp_path / "transforms.images-2").mkdir()
     (tmp_path / "photos").mkdir()
-    for name in ("c.png", "photos/d.png", "transforms.images-2/e.png", "dynamic_mask_c.png"):
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "transforms.json").write_text('{"made_by": "kpposes"}')
+    for name in ("c.png", "photos/d.png", "transforms.images-2/e.png", "dynamic_mask_c.png", "masks/c.png"):
         Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / name)
     assert kpposes.main([str(tmp_path), "-o", str(tmp_path / "x.json"), "--rig", "still"]) == 1
     said = "2 files beside the videos belong to no camera and are left out: c.png, photos/d.png\n"
     assert said in capsys.readouterr().err
 
 
-def test_masks_are_no_footage(tmp_path):
-    for folder in ("images", "masks"):
+@pytest.mark.parametrize(("name", "unused"), [("masks", []), ("Mask", [f"Mask/{n}.png" for n in range(6)])])
+def test_masks_are_no_footage(tmp_path, name, unused):
+    for folder in ("images", name):
         (tmp_path / folder).mkdir()
         for number in range(6):
             Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / folder / f"{number}.png")
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "images" / "dynamic_mask_0.png")
     footage = find_footage(tmp_path)
-    assert [one.files[0].parent.name for one in footage] == ["images"] * 6 and left_out(tmp_path, footage) == []
+    assert [one.files[0].parent.name for one in footage] == ["images"] * 6 and left_out(tmp_path, footage) == unused
+
+
+def test_folders_of_frames_may_have_any_name(tmp_path):
+    for folder in ("left.images", "right"):
+        (tmp_path / folder).mkdir()
+        for number in range(6):
+            Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / folder / f"{number}.png")
+    assert [one.name for one in find_footage(tmp_path)] == ["left.images", "right"]
 
 
 def test_an_empty_folder_is_refused(tmp_path):

@@ -53,6 +53,15 @@ def test_views_that_only_fit_each_other_are_named():
     assert said.startswith("cam07, cam08, cam09 fit each other but not the rest")
 
 
+def test_pinholes_wider_than_any_lens_are_named():
+    model = structure(line(5))
+    for focal, is_fisheye, count in ((23.0, False, 1), (24.0, False, 0), (10.0, True, 0)):
+        views = model.views | {3: replace(model.views[3], intrinsics=(focal, focal, 50.0, 50.0), is_fisheye=is_fisheye)}
+        said = doubts("still rig", NAMES, replace(model, views=views))
+        assert len(said) == count
+        assert all(one.startswith("cam03 would have a pinhole lens of 131 degrees across") for one in said)
+
+
 def test_few_points_are_named():
     model = structure(line(5))
     views = {number: replace(view, points=[90, 20, 60, 40, 300][number]) for number, view in model.views.items()}
