@@ -45,8 +45,8 @@ RENDERINGS = 8  # scenes that a search renders, about
 
 DEFAULT_LOSS_DB = 0.15  # PSNR that coding may cost where no target is given
 
-# A fine-tuned coding this share below the bytes or the error that it may not exceed is good enough: its error is
-# predicted less well.
+# A fine-tuned coding this share below the bytes or the error that it may not exceed is good enough at first, later ones
+# further below (`find_tuned_limit`): its error is predicted less well.
 TUNED_BYTES_TOLERANCE, TUNED_ERROR_TOLERANCE = 0.05, 0.1
 TUNED_ERROR, TUNED_BYTES = 0.7, 1.01  # error and bytes with fine-tuning, as a share of those without, about
 LEAST_TUNED_ERROR = 0.4  # less than fine-tuning was seen to leave of the error; 0.5 was

@@ -138,7 +138,8 @@ def find_tuned_limit(
         tuned: makes a fine-tuned attempt of an exponent.
         value: of an attempt.
         limit: what the value may not exceed.
-        enough: the search ends with a value within this share below the limit, or after MAX_TUNINGS.
+        enough: the search ends with a value within this share below the limit, after each further attempt half as much
+            more, or after MAX_TUNINGS.
         gain: expected ratio of values with and without fine-tuning.
         slope: expected change of log value per octave towards `end`, where no attempt says more.
 
@@ -158,14 +159,14 @@ def find_tuned_limit(
     wanted = math.log(limit * (1 - enough / 2))
     exponent, best = found.exponent + (wanted - math.log(gain * value(found))) / slope, None
     known: list[tuple[float, float]] = []
-    for _ in range(MAX_TUNINGS):
+    for number in range(MAX_TUNINGS):
         candidate = tuned(_clamp(exponent, start, end))
         reached = value(candidate)
         if not reached > 0:  # true for NaN
             break
         if reached <= limit and (best is None or (candidate.exponent - best.exponent) * slope > 0):
             best = candidate
-        if (1 - enough) * limit <= reached <= limit:
+        if (1 - enough * (1 + number / 2)) * limit <= reached <= limit:
             break
         known.append((candidate.exponent, math.log(reached)))
         exponent = _extrapolate(known, wanted, slope)

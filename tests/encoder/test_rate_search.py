@@ -38,6 +38,12 @@ def test_noisy_fine_tunings_reach_the_tolerance(noise: tuple[float, ...], tuning
     assert found is not None and 0.9 <= found.error <= 1 and len(seen) == tunings
 
 
+@pytest.mark.parametrize("noise, least, tunings", [(1.3, 0.88, 2), (1.25, 0.98, 4)])
+def test_the_second_fine_tuning_may_be_half_as_much_further_below(noise: float, least: float, tunings: int) -> None:
+    found, seen = rough([1.4, noise, 1.45, 1.4])
+    assert len(seen) == tunings and found is not None and least <= found.error <= least + 0.02
+
+
 def test_a_bracketed_limit_is_interpolated() -> None:
     _, seen = rough([0.7, 1.4, 1.35, 0.9])
     assert seen[0].error < 0.9 and seen[1].error > 1 and seen[2].error > 1
