@@ -77,10 +77,10 @@ def _frames_of(found: Found, number: int, root: Path) -> list[dict[str, Any]]:
     if footage.video is None:
         times = frame_times(footage) / max(len(footage.files) - 1, 1)
         return [
-            {"file_path": _relative(image, root)} | ({"time": float(time)} if len(footage.files) > 1 else {}) | camera
+            _file(image, root) | ({"time": float(time)} if len(footage.files) > 1 else {}) | camera
             for image, time in zip(footage.files, times, strict=True)
         ]
-    return [{"file_path": _relative(footage.files[0], root)} | _clock(clock) | camera]
+    return [_file(footage.files[0], root) | _clock(clock) | camera]
 
 
 def _clock(clock: Clock) -> dict[str, float]:
@@ -94,24 +94,23 @@ def _moving_cameras(found: Found, take: Take, root: Path, images: Path) -> dict[
     if take.fps is not None and take.start_s is not None:
         document |= {"fps": take.fps, "start_s": take.start_s}
         document["videos"] = [
-            {"file_path": _relative(one.files[0], root)} | _clock(clock)
-            for one, clock in zip(found.footage, found.clocks, strict=True)
+            _file(one.files[0], root) | _clock(clock) for one, clock in zip(found.footage, found.clocks, strict=True)
         ]
     for footage, track in zip(found.footage, take.tracks, strict=True):
         placed = {frame for frame in track.frames if track.view_of(frame) in found.structure.views}
-        files = {frame: _relative(footage.files[frame], root) for frame in placed} if footage.video is None else {}
+        files = {frame: _file(footage.files[frame], root) for frame in placed} if footage.video is None else {}
         if footage.video is not None and placed:
             names = {
                 frame: f"{images.name}/{name}.png"
                 for frame, name in zip(track.frames, track.frame_names, strict=True)
                 if frame in placed
             }
-            files |= names
+            files |= {frame: {"file_path": name} for frame, name in names.items()}
             _write_frames(footage, track.frames, {frame: images.parent / name for frame, name in names.items()})
         size = frame_size(footage)
         cameras = {view: _camera(found, view, size) for view in track.views if view in found.structure.views}
         document["frames"] += [
-            {"file_path": files[frame], "time": float(time)} | cameras[track.view_of(frame)]
+            files[frame] | {"time": float(time)} | cameras[track.view_of(frame)]
             for frame, time in zip(track.frames, track.times, strict=True)
             if frame in placed
         ]
@@ -128,8 +127,9 @@ def _write_frames(footage: Footage, frames: range, files: dict[int, Path]) -> No
             write_image(files[frame], picture)
 
 
-def _relative(file: Path, root: Path) -> str:
-    return file.relative_to(root).as_posix()
+def _file(file: Path, root: Path) -> dict[str, Any]:
+    """Return the name of a file and its size, by which it is noticed if it is replaced."""
+    return {"file_path": file.relative_to(root).as_posix(), "bytes": file.stat().st_size}
 
 
 def _camera(found: Found, number: int, size: tuple[int, int]) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Several cameras that move: where and when their pictures were taken, what is said of them, and what is refused."""
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -166,6 +167,23 @@ def test_it_is_said_where_a_document_is_read(films, placed, tmp_path, capsys, na
 def test_a_camera_or_a_picture_is_held_out_by_its_name(file, tmp_path, holdout, count):
     held_out = nerfstudio.read(file.parent, holdout, file).views
     assert sum(view.is_test for view in held_out) == count
+
+
+def test_edits_without_effect_and_other_footage_are_named(walks, file, tmp_path, capsys):
+    root = tmp_path / "found"
+    shutil.copytree(file.parent, root)
+    document = json.loads((root / "transforms.json").read_text())
+    sizes = {video["file_path"]: video["bytes"] for video in document["videos"]}
+    assert sizes == {f"{name}.mp4": (walks / f"{name}.mp4").stat().st_size for name in FOCALS}
+    nerfstudio.read(root, None, footage=walks)
+    assert "warning" not in capsys.readouterr().err
+    document["videos"][0]["bytes"] += 1
+    document["frames"][3]["time_offset"] = 0.3
+    (root / "transforms.json").write_text(json.dumps(document))
+    nerfstudio.read(root, None, footage=walks)
+    said = capsys.readouterr().err
+    assert "warning: left.mp4 changed since kpposes found the cameras" in said
+    assert "warning: time_offset and time_rate of 000005.png have no effect" in said
 
 
 def test_the_page_shows_the_paths_and_a_picture_of_each(file):

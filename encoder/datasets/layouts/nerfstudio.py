@@ -3,8 +3,10 @@
 Source: https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from kpc.encoder.datasets.capture import Capture, CapturedView, first_names, holdout_flags, natural_key
 from kpc.encoder.datasets.layouts.splits import split_of
@@ -20,6 +22,7 @@ from kpc.encoder.datasets.layouts.transforms import (
 from kpc.encoder.datasets.left_out import media_in
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media_files import is_video
+from kpc.format.common.text import notice
 from kpc.format.scene.camera_checks import number_of
 
 # The layout's name in messages.
@@ -27,6 +30,8 @@ NAME = "nerfstudio"
 
 # What a document of `kpposes` says it was made by.
 MADE_BY = "kpposes"
+# Keys of the clock of a video.
+CLOCK = {"time_offset", "time_rate"}
 
 
 def recognise(path: Path) -> bool:
@@ -75,11 +80,42 @@ def read(path: Path, holdout: str | None, transforms: Path | None = None, footag
     left_out = tuple(image for image, part in zip(images, split, strict=True) if part is None)
     in_folders = tuple(media for folder in sorted({image.parent for image in images}) for media in media_in(folder))
     is_ours = document.get("made_by") == MADE_BY
+    clocked = [image.name for number, image in found.items() if CLOCK & document["frames"][number].keys()]
+    if clocked and not films:
+        notice(
+            f"{file}: warning: {' and '.join(sorted(CLOCK))} of {first_names(clocked)} have no effect: they are for "
+            "videos, while images have a time of their own"
+        )
     views = _named_by_folder(path, views) if is_ours else views
     fps, frame_count = frame_rate(file, document), clip_frames(file, document)
     sources = films_of(footage or path, file, document)
     start_s = number_of(str(file), document, "start_s") if sources else None
+    if is_ours:
+        _warn_of_changes(file, document, found, footage or path)
     return Capture(NAME, views, fps, in_folders, left_out, is_ours, frame_count, sources, start_s)
+
+
+def _warn_of_changes(file: Path, document: dict[str, Any], found: Mapping[int, Path], footage: Path) -> None:
+    """Say which files have another size than when `kpposes` found their cameras.
+
+    Args:
+        file: the document, for messages.
+        document: from `load_transforms`.
+        found: files by the numbers of their frames.
+        footage: the folder of the videos that the document lists.
+    """
+    entries = [(document["frames"][number], image) for number, image in found.items()]
+    entries += [(video, footage / video["file_path"]) for video in document.get("videos") or ()]
+    changed = [
+        media.name
+        for entry, media in entries
+        if isinstance(entry.get("bytes"), int) and media.is_file() and media.stat().st_size != entry["bytes"]
+    ]
+    if changed:
+        notice(
+            f"{file}: warning: {first_names(changed)} changed since kpposes found the cameras, which may be wrong now; "
+            "run it again"
+        )
 
 
 def _named_by_folder(path: Path, views: tuple[CapturedView, ...]) -> tuple[CapturedView, ...]:

@@ -20,7 +20,7 @@ READ = frozenset(
     "frames file_path transform_matrix time fps near far w h fl_x fl_y camera_angle_x camera_angle_y x_fov y_fov cx cy "
     "k1 k2 p1 p2 k3 k4 k5 k6 distortion_params camera_model camera_type is_fisheye mask_path enable_ray_loading "
     "train_filenames val_filenames test_filenames time_offset time_rate "
-    "frame_count start_s videos".split()
+    "frame_count start_s videos bytes".split()
 )
 
 # Keys without effect, although other programs use them, by the reason that is given to the user.
