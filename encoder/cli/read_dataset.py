@@ -106,7 +106,8 @@ def _refuse_early(options: Options) -> None:
     options.trade.check_size(None)
     if (given := options.wishes.options_given()) and has_layout(options.source):
         raise UsageError(
-            f"{', '.join(given)}: {options.source} has poses, so none are looked for; drop it, or give it to kpposes"
+            f"{', '.join(given)}: {options.source} has poses, so none are looked for; drop what is not used here, or "
+            "give it to kpposes"
         )
 
 
