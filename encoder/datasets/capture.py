@@ -308,7 +308,7 @@ def holdout_flags(path: Path, names: Sequence[str], holdout: str | None, default
     if not any(chosen):
         chosen = [any(map(is_meant, path.parents)) for path in paths]
     if not any(chosen):
-        folders = list(dict.fromkeys(folder.name for folder in (one.parent for one in paths) if folder.name))
+        folders = list(dict.fromkeys(one.parent.name for one in paths if one.parent.name))
         known = folders if len(folders) > 1 else [one.stem for one in paths]
         raise DatasetError(
             f"{path}: no file or folder is named {holdout!r}; give --holdout one of {first_names(known)}"

@@ -1,6 +1,6 @@
 """Which images and videos of a dataset's folder are not used, so that it can be said."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from kpc.encoder.datasets.capture import Capture, first_names
@@ -20,6 +20,12 @@ def media_in(folder: Path, *, recursive: bool = False) -> list[Path]:
     ]
 
 
+def left_out_clause(names: Sequence[str]) -> str:
+    """Return the end of a sentence about files that belong to no camera, with the first of their names."""
+    verb = agreeing(len(names), "belongs to no camera and is", "belong to no camera and are")
+    return f"{verb} left out: {first_names(names)}"
+
+
 def count_left_out(root: Path, capture: Capture, masks: Iterable[Path]) -> int:
     """Return how many files a layout found but does not use, and name those for which it has not given a reason.
 
@@ -32,9 +38,5 @@ def count_left_out(root: Path, capture: Capture, masks: Iterable[Path]) -> int:
     left_out = {*capture.found, *capture.left_out} - used - set(masks)
     unnamed = sorted(file.relative_to(root).as_posix() for file in left_out - set(capture.left_out))
     if unnamed:
-        notice(
-            f"{root}: {len(unnamed)} of {counted(len(used | left_out), 'file')} found "
-            f"{agreeing(len(unnamed), 'belongs to no camera and is', 'belong to no camera and are')} left out: "
-            f"{first_names(unnamed)}"
-        )
+        notice(f"{root}: {len(unnamed)} of {counted(len(used | left_out), 'file')} found {left_out_clause(unnamed)}")
     return len(left_out)

@@ -98,15 +98,12 @@ def _moving_cameras(found: Found, take: Take, root: Path, images: Path) -> dict[
         ]
     for footage, track in zip(found.footage, take.tracks, strict=True):
         placed = {frame for frame in track.frames if track.view_of(frame) in found.structure.views}
-        files = {frame: _file(footage.files[frame], root) for frame in placed} if footage.video is None else {}
-        if footage.video is not None and placed:
-            names = {
-                frame: f"{images.name}/{name}.png"
-                for frame, name in zip(track.frames, track.frame_names, strict=True)
-                if frame in placed
-            }
-            files |= {frame: {"file_path": name} for frame, name in names.items()}
-            _write_frames(footage, track.frames, {frame: images.parent / name for frame, name in names.items()})
+        if footage.video is None:
+            files = {frame: _file(footage.files[frame], root) for frame in placed}
+        else:
+            names = dict(zip(track.frames, track.frame_names, strict=True))
+            files = {frame: {"file_path": f"{images.name}/{names[frame]}.png"} for frame in placed}
+            _write_frames(footage, track.frames, {frame: images / f"{names[frame]}.png" for frame in placed})
         size = frame_size(footage)
         cameras = {view: _camera(found, view, size) for view in track.views if view in found.structure.views}
         document["frames"] += [
@@ -120,6 +117,8 @@ def _moving_cameras(found: Found, take: Take, root: Path, images: Path) -> dict[
 def _write_frames(footage: Footage, frames: range, files: dict[int, Path]) -> None:
     """Write some of the frames of a video into files, by their numbers; those have none that are not wanted."""
     assert footage.video is not None
+    if not files:
+        return
     next(iter(files.values())).parent.mkdir(parents=True, exist_ok=True)
     pictures = zip(frames, read_video(footage.files[0], footage.video, frames.start, frames.stop), strict=True)
     for frame, picture in progress(pictures, f"writing frames of {footage.name}", len(frames), "frame"):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from kpc.encoder.datasets.capture import first_names
+from kpc.encoder.datasets.left_out import left_out_clause
 from kpc.encoder.poses.clocks import UNKNOWN, Clock
 from kpc.encoder.poses.doubts import MATCHED, by_camera, doubts
 from kpc.encoder.poses.false_views import without_false_views
@@ -92,11 +93,8 @@ def find_poses(root: Path, wishes: Wishes) -> Found:
     footage = find_footage(root)
     check_installed()
     if unused := left_out(root, footage):
-        notice(
-            f"{root}: {counted(len(unused), 'file')} beside the {'videos' if footage[0].video else 'images'} "
-            f"{agreeing(len(unused), 'belongs to no camera and is', 'belong to no camera and are')} left out: "
-            f"{first_names(unused)}"
-        )
+        used = "videos" if footage[0].video else "images"
+        notice(f"{root}: {counted(len(unused), 'file')} beside the {used} {left_out_clause(unused)}")
     counts = [frame_count(one) for one in footage]
     if max(counts) == 1 and footage[0].video is not None:
         raise DatasetError(f"{root}: its videos have one frame each; give whole videos, or photographs as images")
@@ -134,8 +132,9 @@ def _what(footage: Sequence[Footage], surveys: Sequence[Survey], is_still: bool,
     shares = sorted(seen.still_share for seen in surveys if np.isfinite(seen.still_share))
     why = "as --rig says"
     if rig == "auto":
-        stays = f"{spanned(f'{shares[0]:.0%}', f'{shares[-1]:.0%}')} of a picture's texture stays" if shares else ""
-        why = stays or "pictures have no texture"
+        why = "pictures have no texture"
+        if shares:
+            why = f"{spanned(f'{shares[0]:.0%}', f'{shares[-1]:.0%}')} of a picture's texture stays"
     if is_still:
         stand = agreeing(len(footage), "stands", "stand")
         return f"taken for a rig of {counted(len(footage), 'camera')} that {stand} still ({why})"

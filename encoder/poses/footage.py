@@ -19,7 +19,7 @@ LEAST_FRAMES = 5
 # How the names of folders end into which `kpposes` writes frames; a number follows where there are several.
 FRAMES = ".images"
 # Names of folders that hold masks, in small letters; only those in `masks` are used.
-MASK_FOLDERS = ("masks", "mask")
+MASK_FOLDERS = (MASKS, "mask")
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,7 @@ def left_out(root: Path, footage: Iterable[Footage]) -> list[str]:
     Masks do not count, nor do frames that `kpposes` wrote beside a document that is still there.
     """
     used = {file for one in footage for file in one.files}
-    folders = [
-        folder
-        for folder in root.iterdir()
-        if folder.is_dir() and not is_hidden(folder) and folder.name != MASKS and not _has_document(folder)
-    ]
+    folders = [folder for folder in _folders(root) if folder.name != MASKS and not _has_document(folder)]
     found = [file for folder in (root, *folders) for file in media_in(folder)]
     return sorted(
         (
@@ -101,7 +97,7 @@ def videos_by_name(root: Path) -> dict[str, Path]:
     """
     found = [file for file in media_in(root) if is_video(file)]
     if not found:
-        found = [file for folder in _folders(root) for file in media_in(folder) if is_video(file)]
+        found = [file for folder in _footage_folders(root) for file in media_in(folder) if is_video(file)]
     parents = [file.parent for file in found]
     by_folder = bool(found) and found[0].parent != root and len(set(parents)) == len(parents)
     files = {(file.parent.name if by_folder else file.stem): file for file in found}
@@ -113,7 +109,7 @@ def videos_by_name(root: Path) -> dict[str, Path]:
 
 def _frame_folders(root: Path) -> dict[str, tuple[Path, ...]]:
     found = {}
-    for folder in _folders(root):
+    for folder in _footage_folders(root):
         images = _images_in(folder)
         if len(images) >= LEAST_FRAMES:
             found[folder.name] = tuple(sorted(images, key=lambda file: natural_key(file.name)))
@@ -121,7 +117,7 @@ def _frame_folders(root: Path) -> dict[str, tuple[Path, ...]]:
 
 
 def _of_only_folder(root: Path) -> list[Path]:
-    folders = [images for folder in _folders(root) if (images := _images_in(folder))]
+    folders = [images for folder in _footage_folders(root) if (images := _images_in(folder))]
     return folders[0] if len(folders) == 1 else []
 
 
@@ -130,7 +126,10 @@ def _images_in(folder: Path) -> list[Path]:
     return [file for file in media_in(folder) if is_image(file) and not file.name.startswith(DYNAMIC_MASK)]
 
 
-def _folders(root: Path) -> list[Path]:
+def _footage_folders(root: Path) -> list[Path]:
     """Return the folders in a folder that may hold footage: not those of masks."""
-    folders = sorted(folder for folder in root.iterdir() if folder.is_dir() and not is_hidden(folder))
-    return [folder for folder in folders if folder.name.lower() not in MASK_FOLDERS]
+    return [folder for folder in _folders(root) if folder.name.lower() not in MASK_FOLDERS]
+
+
+def _folders(root: Path) -> list[Path]:
+    return sorted(folder for folder in root.iterdir() if folder.is_dir() and not is_hidden(folder))

@@ -11,6 +11,7 @@ from typing import Any
 from kpc.encoder.datasets.capture import Capture, CapturedView, first_names, holdout_flags, natural_key
 from kpc.encoder.datasets.layouts.splits import split_of
 from kpc.encoder.datasets.layouts.transforms import (
+    CLOCK,
     clip_frames,
     films_of,
     find_images,
@@ -30,8 +31,6 @@ NAME = "nerfstudio"
 
 # What a document of `kpposes` says it was made by.
 MADE_BY = "kpposes"
-# Keys of the clock of a video.
-CLOCK = {"time_offset", "time_rate"}
 
 
 def recognise(path: Path) -> bool:
@@ -80,10 +79,10 @@ def read(path: Path, holdout: str | None, transforms: Path | None = None, footag
     left_out = tuple(image for image, part in zip(images, split, strict=True) if part is None)
     in_folders = tuple(media for folder in sorted({image.parent for image in images}) for media in media_in(folder))
     is_ours = document.get("made_by") == MADE_BY
-    clocked = [image.name for number, image in found.items() if CLOCK & document["frames"][number].keys()]
+    clocked = [image.name for number, image in found.items() if document["frames"][number].keys() & CLOCK]
     if clocked and not films:
         notice(
-            f"{file}: warning: {' and '.join(sorted(CLOCK))} of {first_names(clocked)} have no effect: they are for "
+            f"{file}: warning: {' and '.join(CLOCK)} of {first_names(clocked)} have no effect: they are for "
             "videos, while images have a time of their own"
         )
     views = _named_by_folder(path, views) if is_ours else views

@@ -31,6 +31,9 @@ from kpc.format.common.text import notice
 from kpc.format.scene.camera_checks import DISTORTION_KEYS, Distortion, check_depths, number_of, pose_of
 from kpc.format.scene.camera_models import FISHEYE_MODELS, understood_model
 
+# Keys of the clock of a video: its offset in seconds, and its rate.
+CLOCK = ("time_offset", "time_rate")
+
 # Focal lengths that differ by less than this share are the same.
 SAME_FOCAL = 0.02
 
@@ -142,8 +145,8 @@ def _video_view(where: str, keys: dict[str, Any], video: Path, is_test: bool) ->
 
 
 def _clock(where: str, keys: dict[str, Any]) -> tuple[float, float]:
-    offset, rate = number_of(where, keys, "time_offset", 0.0), number_of(where, keys, "time_rate", 1.0)
-    check_clock(where, ("time_offset", "time_rate"), offset, rate)
+    offset, rate = (number_of(where, keys, name, usual) for name, usual in zip(CLOCK, (0.0, 1.0), strict=True))
+    check_clock(where, CLOCK, offset, rate)
     return offset, rate
 
 
