@@ -113,7 +113,7 @@ def plan_sharing(
         config: of training. dataset: of the whole clip. aabb: (2, 3), its box. mapping: of space beyond the box.
         area: where things move at any time of the clip.
     """
-    layout = plan_layout(replace(config, moving_area=area.box), aabb, dataset.clip, dataset.is_dynamic)
+    layout = plan_layout(config.with_moving_area(area.box), aabb, dataset.clip, dataset.is_dynamic)
     shape = grid_shape(aabb, config.cells_across)
     return Sharing.of_scales(
         layout.still_scales, area.cells(shape) & visible_cells(dataset.pictures, aabb, shape, mapping)

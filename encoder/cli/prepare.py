@@ -170,7 +170,7 @@ def prepare_trainer(options: Options, setting: Setting) -> Trainer:
             aabb, survey_s = trim_with_progress(dataset, config, aabb, options.time_budget_s, mapping)
     moving = (setting.layers or find_layers(options, config, dataset, aabb, mapping)).area
     if moving is not None:
-        config = replace(config, moving_area=moving.box)
+        config = config.with_moving_area(moving.box)
     trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s, mapping=mapping, moving=moving)
     log(*describe_model(trainer).split("\n"))
     changed = ""

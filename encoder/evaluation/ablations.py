@@ -15,10 +15,10 @@ BASELINE = "baseline"
 # pictures (`kpc.encoder.evaluation.evaluate`), runs without on whole pictures.
 ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     BASELINE: lambda c: c,
-    "finest scale only": lambda c: replace(c, resolutions=c.resolutions[-1:]),
-    "coarsest scale only": lambda c: replace(c, resolutions=c.resolutions[:1]),
-    "half the channels": lambda c: replace(c, channels=max(1, c.channels // 2)),
-    "twice the channels": lambda c: replace(c, channels=2 * c.channels),
+    "finest scale only": lambda c: replace(c, resolutions=c.resolutions[-1:], layered_resolutions=()),
+    "coarsest scale only": lambda c: replace(c, resolutions=c.resolutions[:1], layered_resolutions=()),
+    "half the channels": lambda c: _with_channels(c, 0.5),
+    "twice the channels": lambda c: _with_channels(c, 2),
     "view-independent colour": lambda c: replace(c, view_dependent=False, appearance="none"),
     "no time smoothness": lambda c: replace(c, time_smoothness=0.0),
     "time smoothness x 10": lambda c: replace(c, time_smoothness=10 * c.time_smoothness),
@@ -42,6 +42,11 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "all scales from the start": lambda c: replace(c, coarse_until=0.0),
     "scale dropout": lambda c: replace(c, scale_dropout=PROGRESSIVE_SCALE_DROPOUT),
 }
+
+
+def _with_channels(config: TrainConfig, factor: float) -> TrainConfig:
+    layered = max(1, int(factor * config.layered_channels)) if config.layered_resolutions else 0
+    return replace(config, channels=max(1, int(factor * config.channels)), layered_channels=layered)
 
 
 def effective_ablations(config: TrainConfig) -> list[str]:

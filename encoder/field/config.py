@@ -52,8 +52,11 @@ class TrainConfig:
     motion_cells: int = 0
     # Lower and upper corner of the area in which things move, in shares of the space that the planes cover. Each of
     # `resolutions` then makes two scales: one without space-time planes, and one with them that holds nothing outside
-    # the area (`kpc.encoder.training.moving_area`). None: scales of six planes that cover everything.
+    # the area (`with_moving_area`). None: scales of six planes that cover everything.
     moving_area: tuple[float, ...] | None = None
+    # What replaces `resolutions` and `channels` where there is such an area; (): nothing does (measured).
+    layered_resolutions: tuple[int, ...] = ()
+    layered_channels: int = 0
     # Texels of such a scale along the longest edge of the area, as a share of those of the other along that of the box;
     # 0: no such scales.
     moving_texels: float = 0.6
@@ -249,8 +252,12 @@ class TrainConfig:
             raise UsageError(f"appearance must be one of {', '.join(APPEARANCES)}, not {self.appearance}")
         if self.appearance != "none" and not self.view_dependent:
             raise UsageError(f"appearance {self.appearance} needs view_dependent: codes act through the direction MLP")
-        if not self.resolutions or min(self.resolutions) < 2:
-            raise UsageError(f"resolutions {self.resolutions}: every scale needs at least 2 texels")
+        if not self.resolutions or min(self.resolutions + self.layered_resolutions) < 2:
+            raise UsageError(
+                f"resolutions {self.resolutions + self.layered_resolutions}: every scale needs at least 2 texels"
+            )
+        if self.layered_resolutions and self.layered_channels < 1:
+            raise UsageError(f"layered_channels must be at least 1, not {self.layered_channels}")
 
     def variation(self, fraction: float) -> Variation:
         """Return the total variation at a fraction of the run."""
@@ -266,6 +273,17 @@ class TrainConfig:
     def prunes(self) -> bool:
         """Whether the model may be pruned, for which its decoder has to be linear, as the explicit one is."""
         return self.prune_share > 0 and not self.hybrid
+
+    def with_moving_area(self, area: tuple[float, ...]) -> "TrainConfig":
+        """Return this configuration with scales of their own for what moves in an area, `moving_area`.
+
+        Each resolution makes two scales then, so one resolution of more channels may do. All stay where coarse scales
+        are to make a picture by themselves.
+        """
+        if not self.layered_resolutions or self.scale_dropout:
+            return replace(self, moving_area=area)
+        resolutions, channels = self.layered_resolutions, self.layered_channels
+        return replace(self, moving_area=area, resolutions=resolutions, channels=channels)
 
     def for_single_object(self) -> "TrainConfig":
         """Return this configuration, adapted to a moving object without surroundings that one moving camera filmed.
@@ -307,7 +325,15 @@ PRESETS = {
         tune_steps=0,
         thorough_from=6000,
     ),
-    "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3000),
+    "fast": TrainConfig(
+        resolutions=(64, 160),
+        channels=8,
+        layered_resolutions=(160,),
+        layered_channels=16,
+        samples_across=224,
+        cells_across=80,
+        steps=3000,
+    ),
     # Two scales of 16 channels rather than three of 8 (measured).
     "balanced": TrainConfig(resolutions=(96, 256), channels=16, steps=10000, temporal_start=0.75, temporal_floor=0.3),
     "best": TrainConfig(

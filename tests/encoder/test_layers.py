@@ -10,7 +10,7 @@ import torch
 import datasets as make
 from kpc.encoder.coding.scene_writer import write
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import fused_features
 from kpc.encoder.field.layout import Layout, layout_of_planes, plan_layout
@@ -115,6 +115,16 @@ def test_gradients_of_points_are_those_of_the_whole_planes(field: Field) -> None
         (fused_features(one)(*at) * weights).sum().backward()
         gradients.append(torch.cat([at[0].grad, at[1].grad[:, None]], dim=1))
     assert float((gradients[0] - gradients[1]).abs().quantile(0.99)) < 1e-4 * float(gradients[0].abs().max())
+
+
+def test_a_preset_may_have_fewer_resolutions_of_more_channels_for_what_moves_apart() -> None:
+    fast = PRESETS["fast"]
+    layered = fast.with_moving_area(AREA)
+    assert (layered.resolutions, layered.channels, layered.moving_area) == ((160,), 16, AREA)
+    assert plan_layout(layered, EDGES, CLIP, True).features == plan_layout(fast, EDGES, CLIP, True).features * 2
+    assert fast.with_moving_area(AREA) == layered.with_moving_area(AREA)  # of a run that is resumed, or a later group
+    for other in (replace(fast, scale_dropout=0.1), CONFIG):
+        assert other.with_moving_area(AREA) == replace(other, moving_area=AREA)
 
 
 def test_a_file_stores_nothing_outside_the_area(field: Field, tmp_path: Path) -> None:
