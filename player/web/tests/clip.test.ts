@@ -224,6 +224,16 @@ test('a long scene plays in little memory, and what was dropped comes again', as
   });
 });
 
+test('groups that follow each other are buffered without a gap between their frames', async () => {
+  const group = scene({ ...SHORT, frameCount: 101, segmentRows: 32 });
+  const { valueCount } = new Container(group).header;
+  await withClip(grouped([group, group], 101, 0, valueCount).buffer as ArrayBuffer, {}, async (clip) => {
+    clip.setPlayhead({ time: 9.5, rate: 1 });
+    await until(clip, () => clip.scenes.length === 2 && clip.isSettled);
+    assert.deepEqual(clip.buffered, [[0, clip.duration]]);
+  });
+});
+
 test('groups are opened ahead, blended, and released behind the playhead', async () => {
   const group = scene({ ...SHORT, frameCount: 101, segmentRows: 32 });
   const { valueCount } = new Container(group).header;

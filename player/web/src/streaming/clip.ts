@@ -256,12 +256,14 @@ export class Clip extends EventTarget {
     const found: [number, number][] = [];
     for (const scene of this.scenes.sort((a, b) => a.group - b.group)) {
       const [from, until] = this.timeline.displaySpan(scene.group);
-      for (const pair of scene.buffered) {
-        const [start, end] = pair.map((time) => this.timeline.clipTime(scene.group, time));
-        const seconds: [number, number] = [Math.max(start, from) * this.duration, Math.min(end, until) * this.duration];
-        const last = found[found.length - 1];
+      for (const [first, last] of scene.buffered) {
+        // A group is shown until the next one begins, which may be after its last frame.
+        const start = first > 0 ? Math.max(this.timeline.clipTime(scene.group, first), from) : from;
+        const end = last < 1 ? Math.min(this.timeline.clipTime(scene.group, last), until) : until;
+        const seconds: [number, number] = [start * this.duration, end * this.duration];
+        const before = found[found.length - 1];
         if (seconds[0] > seconds[1]) continue;
-        if (last && seconds[0] <= last[1] + 1e-6) last[1] = seconds[1];
+        if (before && seconds[0] <= before[1] + 1e-6) before[1] = seconds[1];
         else found.push(seconds);
       }
     }
