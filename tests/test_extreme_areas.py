@@ -94,9 +94,9 @@ def test_all_renderers_draw_what_float64_does(name: str, density: float | None) 
     camera = scene.cameras[0].resized(8, 6)
     rgb, opacity = rendered_in_float64(read, *camera.rays())
     assert density is None or opacity.max() > 0.999
-    oracle, trained = reference.render_rays(scene, *camera.rays(), TIME), SceneRenderer(scene)
-    pictures = {"numpy": (oracle.rgb, oracle.opacity)}
-    pictures["training"] = trained.render(*camera.rays(), np.full(48, TIME, np.float32))[:2]
+    in_numpy = reference.render_rays(scene, *camera.rays(), TIME)
+    in_training = SceneRenderer(scene).render(*camera.rays(), np.full(len(rgb), TIME, np.float32))
+    pictures = {"numpy": (in_numpy.rgb, in_numpy.opacity), "training": in_training[:2]}
     for who, quality in {"shaders": LEVELS["reference"], "processor": Quality(folded=True)}.items():
         found = Renderer(gl.context(), scene, quality, processor=who == "processor").render(camera, TIME)
         pictures[who] = found.rgb.reshape(-1, 3), found.opacity.ravel()
