@@ -112,7 +112,7 @@ class Layout:
         `still_scales`."""
         return [(start, rows, columns) for s, _, start, rows, columns in self.planes() if s in self.still_scales]
 
-    @property
+    @functools.cached_property
     def still_scales(self) -> tuple[int, ...]:
         """The scales without space-time planes, where others have some."""
         return tuple(np.flatnonzero(self.is_dynamic & (self.resolution[:, 3] == 0)).tolist())

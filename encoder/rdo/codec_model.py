@@ -228,9 +228,14 @@ class _Coder:
         if self.trade.target_bytes is None:
             return self._reduce(whole, self.trade.loss_db(self.uncoded_psnr))
         # What a size costs is known when it has been tried, and falls when bytes are saved elsewhere.
-        chosen, loss_db = whole, math.inf
+        chosen, loss_db, smaller = whole, math.inf, None
         for _ in range(MAX_ESTIMATES):
-            lost = max(0.0, self.uncoded_psnr - self.meet(chosen, 0, ROUGH_TOLERANCE).measured.psnr)
+            found = self.meet(chosen, 0, ROUGH_TOLERANCE)
+            if found.size_bytes <= self.trade.target_bytes:
+                smaller = chosen
+            elif smaller is not None:  # which costs so little that less would be pruned
+                return smaller
+            lost = max(0.0, self.uncoded_psnr - found.measured.psnr)
             mse = (TUNED_ERROR if self.tune_steps else 1.0) * mse_of_loss(self.uncoded_psnr, lost)
             before, loss_db = loss_db, loss_of_mse(self.uncoded_psnr, mse)
             if loss_db >= ESTIMATE_RATIO * before:

@@ -86,9 +86,9 @@ class TileWeights:
         """Draw as `draw` does, including pixels that do not exist or are not usable: (3, count) int64."""
         mass = rng.integers(self._block_ends[-1], size=count)
         block = np.searchsorted(self._block_ends, mass, side="right")
-        running = np.cumsum(self.weights.reshape(-1, _BLOCK)[block], axis=1, dtype=np.int64)
-        inside = mass - (self._block_ends[block] - running[:, -1])
-        tile = block * _BLOCK + (running <= inside[:, None]).sum(1)
+        running = np.cumsum(self.weights.reshape(-1, _BLOCK)[block], axis=1, dtype=np.uint16)
+        inside = (mass - self._block_ends[block] + running[:, -1]).astype(np.uint16)
+        tile = block * _BLOCK + np.count_nonzero(running <= inside[:, None], axis=1)
         picture = np.searchsorted(self.ends, tile, side="right")
         tile_row, tile_column = np.divmod(tile - np.where(picture > 0, self.ends[picture - 1], 0), self.across[picture])
         row, column = np.divmod(rng.integers(self.tile * self.tile, size=count), self.tile)

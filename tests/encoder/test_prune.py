@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import pytest
 from kpc.encoder.coding import scene_writer
 from kpc.encoder.evaluation.evaluate import SceneRenderer, pad_channels
 from kpc.encoder.evaluation.validation_rays import ValidationRays
-from kpc.encoder.rdo.codec_model import Model, code, model_from_file
+from kpc.encoder.rdo import codec_model
+from kpc.encoder.rdo.codec_model import Model, Selection, code, model_from_file
 from kpc.encoder.rdo.prune import (
     SurfaceFeatures,
     elimination_order,
@@ -169,6 +171,22 @@ def test_for_a_target_size_pruning_takes_a_share_of_its_loss(rounded: None) -> N
     model = Model(scene, ValidationRays(*rays, None, Fidelity(scene, rays).truth))
     coded = code(model, Trade(target_bytes=5_500), 0.1, 0)
     assert coded.spare_db < 4 * 0.1 * coded.loss_db  # else ten times that
+
+
+def test_what_meets_a_target_size_is_not_given_up_for_less_pruning(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is pruned costs next to nothing, and for next to nothing not enough would be pruned."""
+    scene = tiny_scene()
+    rays = rays_of(scene)
+    model = Model(scene, ValidationRays(*rays, None, Fidelity(scene, rays).truth))
+
+    def meet(self: codec_model._Coder, chosen: Selection, *_: object) -> SimpleNamespace:
+        lost, size = (0.0, 900) if chosen.spare_db else (2.0, 2000)
+        return SimpleNamespace(size_bytes=size, measured=SimpleNamespace(psnr=self.uncoded_psnr - lost))
+
+    monkeypatch.setattr(codec_model._Coder, "meet", meet)
+    monkeypatch.setattr(codec_model._Coder, "_reduce", lambda self, whole, loss_db: replace(whole, spare_db=loss_db))
+    chosen = codec_model._Coder(model, Trade(target_bytes=1000), 0.1, 0, None, True).select()
+    assert chosen.spare_db == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("strength, goes", [(0.02, True), (3.0, False)])
