@@ -233,7 +233,7 @@ class _Coder:
             found = self.meet(chosen, 0, ROUGH_TOLERANCE)
             if found.size_bytes <= self.trade.target_bytes:
                 smaller = chosen
-            elif smaller is not None:  # which costs so little that less would be pruned
+            elif smaller is not None:  # its loss was so small that too little was pruned for it
                 return smaller
             lost = max(0.0, self.uncoded_psnr - found.measured.psnr)
             mse = (TUNED_ERROR if self.tune_steps else 1.0) * mse_of_loss(self.uncoded_psnr, lost)

@@ -23,7 +23,8 @@ WINDOW = 25
 # Bytes of pixels that are processed at a time while weights are computed: about what the cache holds.
 BAND_BYTES = 1 << 21
 
-# Tiles with a common running sum: 8 bytes of memory per block, and 64 bytes to read for every pixel drawn.
+# Tiles with a common running sum: 8 bytes of memory per block, and 64 bytes to read for every pixel drawn. Sums of the
+# tiles of a block are of 16 bits.
 _BLOCK = 64
 
 
