@@ -29,9 +29,9 @@ class Quality:
             a cubic.
         rays_across: rays across a pixel, at most: as many as it spans texels of the finest scale. Their mean is the
             pixel's colour.
-        reprojection_tolerance: processor only. While the clip plays, a picture is predicted from the one before; blocks
-            of 4 x 4 pixels whose sample pixel differs from the prediction by more than this, of the full range, are
-            marched again. 0: none is predicted.
+        reprojection_tolerance: processor, and in browsers while the camera rests. While the clip plays, a picture is
+            predicted from the one before; blocks of 4 x 4 pixels whose sample pixel differs from the prediction by more
+            than this, of the full range, are marched again. 0: none is predicted.
         interpolation_tolerance: processor only. A picture that is not predicted is marched at a lower resolution first
             and interpolated; the blocks that are off the most are marched until the RMS error left is at most this, of
             the full range. 0: all pixels are marched.

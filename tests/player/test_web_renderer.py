@@ -16,7 +16,9 @@ from kpc.format.container import groups
 from kpc.format.container.groups import GroupInput
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.atlas import Layout
+from kpc.player.cpu.picture import BLOCK
 from kpc.player.cpu.reference import Part, blend, render
+from kpc.player.cpu.reprojection import mismatched_blocks, sample_pixels
 from kpc.player.gl import shader
 from kpc.player.gl.programs import scene_defines
 from kpc.player.gl.shader_constants import block_arrays, decoder_arrays
@@ -47,7 +49,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "unequal scales": unequal_scales,
 }
 PARTS = {Part.FULL: "all", Part.STATIC: "static", Part.DYNAMIC: "dynamic"}
-FRAGMENTS = ["march.glsl", "fold.glsl", "upsample_plane.glsl", "present.glsl", "enlarge.glsl", "average.glsl"]
+FRAGMENTS = [
+    "march.glsl", "fold.glsl", "upsample_plane.glsl", "present.glsl", "enlarge.glsl", "average.glsl", "changes.glsl",
+]  # fmt: skip
 DEFINES = [
     {"COMPUTE": 0, "COUNTED": 0, "DEPTH_LIMIT": 0, "MODE": 0, "ROWS": 1, "MOTION": 0},
     {"COMPUTE": 0, "COUNTED": 1, "DEPTH_LIMIT": 1, "MODE": 1, "ROWS": 0, "MOTION": 1},
@@ -91,6 +95,9 @@ SHOTS = [
 LEAST_DB = {"fastest": 20, "faster": 20, "fast": 20, "balanced": 46, "fine": 50, "finer": 52, "auto": 50}
 LEVEL_SHOTS = [Shot(name, level) for name in ("box", "hybrid", "contracted") for level in LEAST_DB]
 ALL = SHOTS + LEVEL_SHOTS
+# Pictures that follow each other, with small changes and large ones between them.
+FOLLOWING_TIMES = (0.3, 0.302, 0.34, 0.36, 0.362)
+FOLLOWING = [Shot(name, "balanced") for name in ("box", "displaced, contracted", "hybrid")]
 # What is drawn before and after the context is lost.
 LOST = Shot("displaced", "fine")
 
@@ -112,11 +119,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def results(files: dict[str, bytes], tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
-    """Return what the page says: pictures of ALL, shaders of SCENES, two pictures of LOST, the table of levels, and
-    objects left in the end."""
+    """Return what the page says: pictures of ALL, shaders of SCENES, pictures that follow each other and whole ones of
+    FOLLOWING, two pictures of LOST, the table of levels, and objects left in the end."""
     calls = [shot.call for shot in ALL]
     for name in SCENES:
         calls += [("shaders", [Shot(name).call[1][0], FRAGMENTS, defines]) for defines in DEFINES]
+    for shot in FOLLOWING:
+        jobs = [replace(shot, time=time).call[1][0] for time in FOLLOWING_TIMES]
+        calls += [("played", [jobs]), *(("picture", [job]) for job in jobs)]
     served = {shot.file: files[shot.scene] for shot in ALL}
     calls += [("lost", LOST.call[1]), ("levels", []), ("close", [])]
     return web_page.run(tmp_path_factory.mktemp("page"), served, calls)
@@ -165,9 +175,35 @@ def test_shaders_are_composed_as_for_the_desktop(results: list[Any], files: dict
                 np.testing.assert_array_equal(numbers, wanted)
 
 
+def following(before: np.ndarray, whole: np.ndarray, turn: int, tolerance: float) -> np.ndarray:
+    """Return what a picture (H, W, 3) becomes that follows another, rows from below."""
+    rows, columns = sample_pixels(turn, (before.shape[1], before.shape[0]))
+    changed = mismatched_blocks(whole[rows, columns], before[rows, columns], tolerance)
+    is_marched = changed.repeat(BLOCK, 0).repeat(BLOCK, 1)[: len(before), : before.shape[1]]
+    is_marched[rows, columns] = True
+    return np.where(is_marched[..., None], whole, before)
+
+
+@pytest.mark.parametrize("number", range(len(FOLLOWING)), ids=lambda n: FOLLOWING[n].scene)
+def test_pictures_follow_each_other_while_the_camera_rests(number: int, results: list[Any]) -> None:
+    shot, count = FOLLOWING[number], 1 + len(FOLLOWING_TIMES)
+    first = len(ALL) + len(SCENES) * len(DEFINES) + number * count
+    played, *whole = results[first : first + count]
+    assert all(picture["error"] == 0 for picture in (*played, *whole))
+    shown, alone = ([web_page.picture_of(picture, CAMERA)[::-1] for picture in group] for group in (played, whole))
+    np.testing.assert_array_equal(shown[0], alone[0])
+    for turn, (before, picture, wanted) in enumerate(zip(shown, shown[1:], alone[1:], strict=False)):
+        # Shaders compare floats, this test bytes: where that makes a difference, either is right.
+        tolerances = (LEVELS[shot.level].reprojection_tolerance + offset for offset in (-2 / 255, 2 / 255))
+        either = [following(before, wanted, turn, tolerance) for tolerance in tolerances]
+        assert np.mean(np.min([np.abs(picture - each).max(axis=-1) for each in either], axis=0) > 1 / 255) < 0.001
+        assert (picture != before).any()
+    assert any((picture != wanted).any() for picture, wanted in zip(shown, alone, strict=True))
+
+
 def test_the_levels_are_those_of_the_desktop(results: list[Any]) -> None:
     names = {"folded": "folded", "step": "step", "termination": "termination", "resolution": "resolution"}
-    names["raysAcross"] = "rays_across"
+    names |= {"raysAcross": "rays_across", "tolerance": "reprojection_tolerance"}
     assert list(results[-2]) == list(LEVELS)
     for level, quality in results[-2].items():
         assert quality == {name: getattr(LEVELS[level], field) for name, field in names.items()}

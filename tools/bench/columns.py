@@ -275,6 +275,9 @@ COLUMNS: dict[str, list[Column]] = {
         ("auto's choice on", lambda r: ", ".join(r["repeats"][0]["chosen_on"]) or "-"),
         ("software: CPU ms", number("cpu_ms", "{:.0f}")),
         ("fps", number("software_fps", "{:.1f}")),
+        ("at rest: CPU ms", number("resting_cpu_ms", "{:.0f}")),
+        ("fps", number("resting_software_fps", "{:.1f}")),
+        ("PSNR", number("resting_psnr", "{:.1f}")),
     ],
     "webload": [
         ("scene", _name),

@@ -7,7 +7,7 @@ of the shader, and divided by what such a card can look up.
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,8 @@ PLANE_BYTES, ROW_BYTES, CELL_BYTES, SHOWN_BYTES = 8, 16, 1, 4
 # Texels of the smaller picture that a pixel of the larger one takes (cubic.glsl).
 CUBIC_TEXELS = 12
 FRAMES, PLAY_S, TIMEOUT_S = 5, 12, 3600
+# How far a moving camera turns to either side, and pictures until it is back.
+SWAY_DEGREES, SWAY_FRAMES = 10, 60
 
 # Runs calls in a browser of their own.
 Run = Callable[..., list[Any]]
@@ -53,7 +55,7 @@ class Drawing:
 
 def measure(job: Drawing) -> tuple[str, dict[Setting, Record]]:
     """Return what draws, and what was measured for each level, what `auto` chooses on DEVICES and, if timed, for it."""
-    with Progress("drawing", 5 + job.is_timed * (3 + len(LEVELS)), "runs") as bar:
+    with Progress("drawing", 5 + job.is_timed * (6 + len(LEVELS)), "runs") as bar:
         return _measured(job, bar)
 
 
@@ -102,11 +104,13 @@ def _measured(job: Drawing, bar: Progress) -> tuple[str, dict[Setting, Record]]:
     (drawn,) = values(("picture", [job_of({"level": "fastest", "scale": 0.1})]))
     if not job.is_timed:
         return drawn["name"], measured
-    bar.extend(3 + len(measured))
-    ((setting, played),) = _timed(run, job_of, camera, reference, measured).items()
-    (played["decode_ms"],) = values(("decode", [job.scene.name]))
-    played["python_decode_ms"] = decode_bench.measure(job.scene)["decode_ms"]
-    return drawn["name"], measured | {setting: played}
+    bar.extend(6 + len(measured))
+    chosen_by_time = _timed(run, job_of, camera, scene.clip.frame_count, reference, measured)
+    (decode_ms,) = values(("decode", [job.scene.name]))
+    decoding = {"decode_ms": decode_ms, "python_decode_ms": decode_bench.measure(job.scene)["decode_ms"]}
+    for record in chosen_by_time.values():
+        record |= decoding
+    return drawn["name"], measured | chosen_by_time
 
 
 def _looked_up(counted: Record, size: tuple[int, int], is_dynamic: bool) -> Record:
@@ -133,26 +137,52 @@ def _looked_up(counted: Record, size: tuple[int, int], is_dynamic: bool) -> Reco
 
 
 def _timed(
-    run: Run, job_of: Callable[..., Any], camera: Camera, reference: np.ndarray, measured: dict[Setting, Record]
+    run: Run,
+    job_of: Callable[..., Any],
+    camera: Camera,
+    frame_count: int,
+    reference: np.ndarray,
+    measured: dict[Setting, Record],
 ) -> dict[Setting, Record]:
     """Time a processor's pictures of each setting, into `measured`; return what `auto` does."""
     ready = ("picture", [job_of("fastest")])
+    angles = SWAY_DEGREES * np.sin(np.arange(SWAY_FRAMES) * (2 * np.pi / SWAY_FRAMES))
+    cameras = [web_page.camera_of(_turned(camera, angle)) for angle in angles]
     for (level, scale), record in measured.items():
-        times = [(COMPARED_TIME + number / 30) % 1 for number in range(1, 1 + FRAMES)]
-        frames = ("frames", [[job_of({"level": level, "scale": scale}, time) for time in times]])
-        _, _, took = run(ready, frames, frames)
-        record["software_fps"] = 1e3 / float(np.median(took["value"]))
-        record["cpu_ms"] = None if took["cpuSeconds"] is None else 1e3 * took["cpuSeconds"] / FRAMES
-    played, still = run(("play", [job_of("auto"), PLAY_S]), ("picture", [job_of("auto")]))
-    setting = {key: played["value"][key] for key in ("level", "scale")}
-    (picture,) = run(("picture", [job_of(setting)]))
-    took = played["value"]["ms"]
-    return {
-        ("auto", setting["scale"]): {
+        times = [(COMPARED_TIME - number / frame_count) % 1 for number in reversed(range(2 * FRAMES))]
+        jobs = [job_of({"level": level, "scale": scale}, time) for time in times]
+        before, resting = jobs[:FRAMES], jobs[FRAMES:]
+        swaying = [{**job, "camera": seen} for job, seen in zip(resting, cameras, strict=False)]
+        frames = (("frames", [group]) for group in (swaying, swaying, before, resting))
+        _, _, swayed, _, rested, played = run(ready, *frames, ("played", [resting]))
+        record |= _spent(swayed) | {f"resting_{name}": value for name, value in _spent(rested).items()}
+        record["resting_psnr"] = float(psnr(web_page.picture_of(played["value"][-1], camera), reference))
+    (still,) = run(("picture", [job_of("auto")]))
+    found: dict[Setting, Record] = {}
+    for name, seen in (("auto", cameras), ("auto, at rest", cameras[:1])):
+        (played,) = run(("play", [job_of("auto"), PLAY_S, seen]))
+        setting, took = {key: played["value"][key] for key in ("level", "scale")}, played["value"]["ms"]
+        (picture,) = run(("picture", [job_of(setting)]))
+        found[name, setting["scale"]] = {
             "raster": f"{setting['level']}, {setting['scale']:.2f}",
             "software_fps": 1e3 / float(np.median(took[len(took) // 2 :])),
             "psnr": float(psnr(web_page.picture_of(picture["value"], camera), reference)),
             "psnr_still": float(psnr(web_page.picture_of(still["value"], camera), reference)),
             "chosen_on": [],
         }
-    }
+    return found
+
+
+def _turned(camera: Camera, degrees: float) -> Camera:
+    """Return the camera turned about its own upward axis."""
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    pose = camera.camera_to_world.copy()
+    pose[:3, :3] = pose[:3, :3] @ np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+    return replace(camera, camera_to_world=pose)
+
+
+def _spent(took: Record) -> Record:
+    """Return the frames a second of `frames`, and the milliseconds of all cores for each."""
+    cpu_s = took["cpuSeconds"]
+    fps = 1e3 / float(np.median(took["value"]))
+    return {"software_fps": fps, "cpu_ms": None if cpu_s is None else 1e3 * cpu_s / FRAMES}

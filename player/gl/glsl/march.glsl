@@ -17,6 +17,7 @@
 #include "motion.glsl"
 #include "planes.glsl"
 #include "decoder.glsl"
+#include "follow.glsl"
 #if DEPTH_LIMIT
 #include "limits.glsl"
 #endif
@@ -52,9 +53,15 @@ uniform float height;
 uniform vec4 lens;
 uniform mat3 axes;
 uniform vec3 eye;
-#if DEPTH_LIMIT
 uniform float width;  // of the raster, pixels; `height` is its height
-#endif
+
+// Which pixels are marched: all, the sample pixel of each block, or those of blocks that have changed (follow.glsl).
+const int ALL = 0, SAMPLED = 1, CHANGED = 2;
+uniform int marched;
+uniform int turn;           // of the sample pixels
+uniform sampler2D sampled;  // CHANGED: the sample pixels, one of each block, as marched before
+uniform sampler2D changes;  // CHANGED: which blocks have changed
+uniform sampler2D before;   // CHANGED: the picture that shows the others
 
 #if HIDDEN
 // e of a direction, in three parts: x y z xx, yy zz xy yz, zx 1; the last is for b1.
@@ -315,6 +322,15 @@ layout(location = 0) out vec4 rgba;
 layout(location = 1) out vec4 sums;
 
 void main() {
-    march(gl_FragCoord.xy, rgba, sums);
+    ivec2 at = ivec2(gl_FragCoord.xy), block = at / BLOCK, size = ivec2(width, height);
+    bool is_sampled = marched == CHANGED && at == sample_pixel(block, turn, size);
+    bool is_kept = marched == CHANGED && !is_sampled && texelFetch(changes, block, 0).r < 0.5;
+    if (marched == SAMPLED) at = sample_pixel(at, turn, size);
+    if (!is_sampled && !is_kept) {
+        march(vec2(at) + 0.5, rgba, sums);
+    } else {
+        rgba = is_sampled ? texelFetch(sampled, block, 0) : texelFetch(before, at, 0);
+        sums = vec4(0.0);
+    }
 }
 #endif

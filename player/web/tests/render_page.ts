@@ -8,10 +8,11 @@ import type { DrawnScene } from '../src/render/drawn_scene.js';
 import { costOf, Pace, type Setting, settingsOf } from '../src/render/pace.js';
 import type { Moment, ShownPart } from '../src/render/picture_job.js';
 import { LEVELS, type Level } from '../src/render/quality.js';
-import { type DrawnPicture, FIRST_RAYS, Renderer } from '../src/render/renderer.js';
+import { type DrawnPicture, Renderer } from '../src/render/renderer.js';
 import { sceneDefines } from '../src/render/scene_textures.js';
 import { type Composed, compose, constants, type Defines } from '../src/render/shader.js';
 import { blockArrays, decoderArrays } from '../src/render/shader_constants.js';
+import { FIRST_RAYS } from '../src/render/speed.js';
 import { Clip, type SceneEvent } from '../src/streaming/clip.js';
 import type { SceneStream } from '../src/streaming/scene_stream.js';
 
@@ -94,6 +95,26 @@ async function finished(renderer: Renderer): Promise<void> {
   while (renderer.isBusy) await pause(0);
 }
 
+/** Draw one picture, all that it needs being there. */
+async function drawnOnce(job: Job): Promise<Renderer> {
+  const { renderer, moments, options } = await prepared(job);
+  const before = renderer.pictures;
+  for (let isSharp = false; renderer.pictures === before && !isSharp; await finished(renderer)) {
+    isSharp = renderer.draw(job.camera, moments(), options).isSharp;
+  }
+  return renderer;
+}
+
+/** Return the bytes RGBA of the last picture, rows from below, in base64. */
+function pixelsOf(renderer: Renderer, { width, height }: Camera): string {
+  const { gl } = renderer;
+  const pixels = new Uint8Array(4 * width * height);
+  renderer.present();
+  gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+  return base64(pixels);
+}
+
 function base64(bytes: Uint8Array): string {
   let text = '';
   for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
@@ -104,13 +125,7 @@ const page = {
   /** Draw a picture until it is sharp; return its bytes RGBA, rows from below, in base64. */
   async picture(job: Job) {
     const renderer = await drawn(job);
-    const { gl } = renderer;
-    const { width, height } = job.camera;
-    const pixels = new Uint8Array(4 * width * height);
-    renderer.present();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-    return { pixels: base64(pixels), error: gl.getError(), name: renderer.name };
+    return { pixels: pixelsOf(renderer, job.camera), error: renderer.gl.getError(), name: renderer.name };
   },
 
   /**
@@ -146,8 +161,11 @@ const page = {
     return names.indexOf(JSON.stringify(pace.setting(texels)));
   },
 
-  /** Play for some seconds as fast as it goes; return the milliseconds between pictures, and what was drawn last. */
-  async play(job: Job, seconds: number) {
+  /**
+   * Play for some seconds as fast as it goes, from one camera after the other; return the milliseconds between
+   * pictures, and what was drawn last.
+   */
+  async play(job: Job, seconds: number, cameras: Camera[]) {
     const renderer = await drawn(job);
     const clip = (await open(job)).clip;
     const began = performance.now();
@@ -157,8 +175,9 @@ const page = {
       const time = ((performance.now() - began) / 1000 / clip.duration) % 1;
       const { moments, options } = await prepared({ ...job, time });
       const before: number = state?.pictures ?? 0;
+      const camera = cameras[shown.length % cameras.length];
       do {
-        state = renderer.draw(job.camera, moments(), options);
+        state = renderer.draw(camera, moments(), options);
         await finished(renderer);
       } while (state.pictures === before && !state.isSharp);
       shown.push(performance.now());
@@ -184,17 +203,23 @@ const page = {
   async frames(jobs: Job[]): Promise<number[]> {
     const took: number[] = [];
     for (const job of jobs) {
-      const { renderer, moments, options } = await prepared(job);
       const started = performance.now();
-      let state = renderer.draw(job.camera, moments(), options);
-      for (const before = state.pictures; state.pictures === before && !state.isSharp; ) {
-        await finished(renderer);
-        state = renderer.draw(job.camera, moments(), options);
-      }
-      await finished(renderer);
+      await drawnOnce(job);
       took.push(performance.now() - started);
     }
     return took;
+  },
+
+  /** Draw pictures one after the other, the first whole, as they come while the clip plays; return each. */
+  async played(jobs: Job[]): Promise<{ pixels: string; error: number }[]> {
+    for (let turn = 0; turn < 10; turn++) await drawnOnce(jobs[turn % 2]); // until all is compiled
+    await drawn(jobs[0]);
+    const pictures: { pixels: string; error: number }[] = [];
+    for (const job of jobs) {
+      const renderer = await drawnOnce(job);
+      pictures.push({ pixels: pixelsOf(renderer, job.camera), error: renderer.gl.getError() });
+    }
+    return pictures;
   },
 
   /** Take the context away and give it back; return the picture of a job before, and the one after. */

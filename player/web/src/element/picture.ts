@@ -52,7 +52,7 @@ export class Picture {
   }
 
   set fps(fps: number | undefined) {
-    this.#renderer.pace.secondsPerFrame = 1 / (fps ?? this.#renderer.usualFps);
+    this.#renderer.fps = fps ?? this.#renderer.usualFps;
   }
 
   /** Set the size in pixels of the screen. */

@@ -3,6 +3,7 @@
 import { type Camera, columnsOf } from './camera.js';
 import type { Device, Framebuffer } from './device.js';
 import { FOLDING, FoldedPlanes } from './folding.js';
+import { ALL_PIXELS, type Pixels } from './following.js';
 import type { Limits } from './merging.js';
 import type { Quality } from './quality.js';
 import { extentOf, type SceneSource } from './scene_source.js';
@@ -18,6 +19,7 @@ export interface Shot {
   background: ArrayLike<number>;
   isCounted?: boolean; // whether look-ups of cells are counted, too
   limits?: Limits | null; // how far rays see
+  pixels?: Pixels; // which are marched; all if left out
 }
 
 /** Bytes of texels that are uploaded at once: to a card, and to a processor, for which they are made float32 before. */
@@ -104,7 +106,7 @@ export class DrawnScene {
     const parts = this.#on(device);
     const { textures, programs } = parts;
     const { head } = this.source;
-    const { camera, time, quality, appearance, limits = null } = shot;
+    const { camera, time, quality, appearance, limits = null, pixels = ALL_PIXELS } = shot;
     const way = this.#way(parts, quality, { ...shot, isLimited: limits !== null });
     textures.setOccupancy(time);
     if (way.defines.MOTION) textures.setMotion(time);
@@ -125,9 +127,15 @@ export class DrawnScene {
       lens: [camera.focal[0], camera.focal[1], camera.centre[0], camera.centre[1]],
       axes: columns.slice(0, 9),
       eye: columns.slice(9),
+      marched: pixels.marched,
+      turn: pixels.turn,
       ...limits?.uniforms,
     });
     textures.bind(planes);
+    // WebGL forbids that a texture is bound to a sampler while it is drawn into, so unused samplers get another one.
+    device.use(pixels.sampled ?? planes, UNIT.sampled);
+    device.use(pixels.changes ?? planes, UNIT.changes);
+    device.use(pixels.before ?? planes, UNIT.before);
     if (limits) device.use(limits.depths, UNIT.limits);
     const { width, height } = target;
     device.draw(program, target.handle, [0, 0, width, height], { scissor: [0, firstRow, width, rowCount] });

@@ -20,8 +20,11 @@ export class FoldedPlanes {
   readonly #foldInto: Framebuffer;
   /** Time and version of the folded planes. */
   #folded = '';
-  /** Blocks of the scene that are upsampled as they are. */
+  /** Blocks of the scene that are upsampled, and folded, as they are. */
   readonly #upsampledBlocks = new Set<Block>();
+  readonly #foldedBlocks = new Set<Block>();
+  /** The rows that are folded. */
+  #foldedRows: Float32Array = new Float32Array(0);
 
   constructor(
     readonly textures: SceneTextures,
@@ -53,6 +56,7 @@ export class FoldedPlanes {
 
   planeChanged(block: Block): void {
     this.#upsampledBlocks.delete(block);
+    this.#foldedBlocks.delete(block);
     this.#folded = '';
   }
 
@@ -68,13 +72,26 @@ export class FoldedPlanes {
         this.#drawBlocks(FOLDING[0], this.#upsampleInto, changed);
         for (const block of changed) this.#upsampledBlocks.add(block);
       }
-      this.#device.write(this.#rows, timeRows(scene, layout, time, this.layout.upsampling));
+      const rows = timeRows(scene, layout, time, this.layout.upsampling);
+      const stale = blocks.filter((block) => !this.#foldedBlocks.has(block) || this.#haveChanged(rows, block));
+      this.#device.write(this.#rows, rows);
       this.#device.use(this.#upsampled, UNIT.planes);
       this.#device.use(this.#rows, UNIT.rows);
-      this.#drawBlocks(FOLDING[1], this.#foldInto, blocks);
+      this.#drawBlocks(FOLDING[1], this.#foldInto, stale);
+      for (const block of stale) this.#foldedBlocks.add(block);
+      this.#foldedRows = rows;
       this.#folded = key;
     }
     return this.#planes;
+  }
+
+  /** Whether the rows for a block are other than those that are folded; they never are where nothing moves. */
+  #haveChanged(rows: Float32Array, block: Block): boolean {
+    const { layout } = this.textures;
+    const line = 4 * this.#rows.size[0];
+    const [first, end] = [0, layout.layers[block.scale]].map((layer) => line * (layout.firstLine(block) + layer));
+    const before = this.#foldedRows.subarray(first, end);
+    return rows.subarray(first, end).some((number, at) => number !== before[at]);
   }
 
   /** Draw planes by a shader that takes as uniforms where each lies and which rows go with it. */

@@ -1,6 +1,6 @@
 /** How finely to draw so that frames come in time: no WebGL. */
 
-import { LEVELS, type Level } from './quality.js';
+import { LEVEL_NAMES, LEVELS, type Level } from './quality.js';
 
 /** A quality level and a scale: the side of the raster over that of the picture, besides what the level takes off. */
 export interface Setting {
@@ -44,7 +44,7 @@ export function settingsOf(texelsPerPixel: number): Setting[] {
 // Share of the time of a frame that drawing may take, and above which it is too slow.
 const IN_TIME = 0.8;
 const TOO_SLOW = 1.05;
-// Frames of one cost before a coarser or a finer one: slow frames disturb at once, a finer picture can wait.
+// Frames of one cost before a coarser or, by default, a finer one: slow frames disturb at once, a finer picture can wait.
 const DOWN_AFTER = 3;
 const UP_AFTER = 8;
 // Frames for which the time of other costs is remembered, and seconds for which that is which proved too slow.
@@ -54,6 +54,8 @@ const AVOIDED_S = 10;
 // over that of the one before.
 const ROOMY = 0.7;
 const NEXT_COST = 1.5;
+// A raster has whole pixels: its cost may be off that of its setting by this factor.
+const ROUNDING = 1.05;
 // Weight of the fictitious frame without rays that takes no time, so that one known time suffices.
 const ORIGIN_WEIGHT = 0.5;
 
@@ -62,6 +64,14 @@ export function costOf({ level, scale }: Setting, texelsPerPixel: number): numbe
   const { resolution, step, raysAcross } = LEVELS[level];
   const rays = Math.max(1, Math.min(Math.floor(texelsPerPixel), raysAcross));
   return (rays * resolution * scale) ** 2 / step;
+}
+
+/** What a `Pace` chooses from, and when: by default among all levels, a finer one after UP_AFTER frames. */
+interface Choice {
+  levels?: readonly Level[];
+  /** Frames of one cost before a finer one, and the share of them that must have left time for it. */
+  upAfter?: number;
+  share?: number;
 }
 
 /**
@@ -74,6 +84,7 @@ export class Pace {
   secondsPerFrame: number;
   /** Rays for each pixel that there is time for, as far as is known. */
   #affordable: number;
+  #isSettled = false;
   #recent: number[] = [];
   #lastCost = 0;
   #frames = 0;
@@ -83,19 +94,34 @@ export class Pace {
   #tooMuch = { cost: Number.POSITIVE_INFINITY, until: 0 };
 
   /** @param affordable rays for each pixel of the first pictures. */
-  constructor(secondsPerFrame: number, affordable: number) {
+  constructor(
+    secondsPerFrame: number,
+    affordable: number,
+    readonly choice: Choice = {},
+  ) {
     this.secondsPerFrame = secondsPerFrame;
     this.#affordable = affordable;
   }
 
-  /** Return the finest setting for which there is time. */
-  setting(texelsPerPixel: number): Setting {
-    const [fastest, ...finer] = settingsOf(texelsPerPixel);
+  /** Rays for each pixel that there is time for, as far as is known. */
+  get affordable(): number {
+    return this.#affordable;
+  }
+
+  /** Whether it was once found that there is no time for more. */
+  get isSettled(): boolean {
+    return this.#isSettled;
+  }
+
+  /** Return the finest setting for which there is time, of those that cost so much at most. */
+  setting(texelsPerPixel: number, mostCost = Number.POSITIVE_INFINITY): Setting {
+    const { levels = LEVEL_NAMES } = this.choice;
+    const [fastest, ...finer] = settingsOf(texelsPerPixel).filter(({ level }) => levels.includes(level));
     this.#coarsest = costOf(fastest, texelsPerPixel);
-    return finer.reduce(
-      (best, setting) => (this.#isAffordable(costOf(setting, texelsPerPixel)) ? setting : best),
-      fastest,
-    );
+    return finer.reduce((best, setting) => {
+      const cost = costOf(setting, texelsPerPixel);
+      return cost <= mostCost && this.#isAffordable(cost) ? setting : best;
+    }, fastest);
   }
 
   /** Take the time of a picture, and how many rays were marched for each of its pixels. */
@@ -107,8 +133,10 @@ export class Pace {
     this.#recent.push(seconds);
     const lately = median(this.#recent.slice(-DOWN_AFTER));
     const isTooSlow = lately > TOO_SLOW * this.secondsPerFrame;
-    if (this.#recent.length < (isTooSlow ? DOWN_AFTER : UP_AFTER)) return;
-    this.#learn(cost, isTooSlow ? lately : median(this.#recent));
+    const { upAfter = UP_AFTER, share = 0.5 } = this.choice;
+    if (this.#recent.length < (isTooSlow ? DOWN_AFTER : upAfter)) return;
+    const typical = isTooSlow ? lately : quantile(this.#recent, share);
+    this.#learn(cost, typical);
     this.#recent = [];
     const { fixed, perRay } = this.#fit();
     // If most of the time does not depend on the rays, fewer of them do more harm than good.
@@ -118,13 +146,20 @@ export class Pace {
     else if (isTooSlow && affordable < cost && cost > this.#coarsest) {
       this.#tooMuch = { cost, until: this.#elapsed + AVOIDED_S };
     }
-    const isRoomy = lately < ROOMY * this.secondsPerFrame;
+    const isRoomy = Math.max(lately, typical) < ROOMY * this.secondsPerFrame;
+    const before = this.#affordable;
     this.#affordable = isTooSlow ? affordable : Math.max(affordable, isRoomy ? NEXT_COST * cost : cost);
+    this.#isSettled ||= this.#affordable <= before;
+  }
+
+  /** Take the time of a single picture: it may show that there is time for more, since few are faster than usual. */
+  recordOne(cost: number, seconds: number): void {
+    this.#affordable = Math.max(this.#affordable, (IN_TIME * this.secondsPerFrame * cost) / seconds);
   }
 
   #isAffordable(cost: number): boolean {
-    const isTooMuch = cost >= this.#tooMuch.cost && this.#elapsed < this.#tooMuch.until;
-    return cost <= this.#affordable && !isTooMuch;
+    const isTooMuch = ROUNDING * cost >= this.#tooMuch.cost && this.#elapsed < this.#tooMuch.until;
+    return cost <= ROUNDING * this.#affordable && !isTooMuch;
   }
 
   #learn(cost: number, seconds: number): void {
@@ -148,7 +183,9 @@ export class Pace {
   }
 }
 
-function median(values: readonly number[]): number {
+const median = (values: readonly number[]): number => quantile(values, 0.5);
+
+function quantile(values: readonly number[], share: number): number {
   const sorted = [...values].sort((a, b) => a - b);
-  return sorted[Math.floor(sorted.length / 2)];
+  return sorted[Math.floor(sorted.length * share)];
 }

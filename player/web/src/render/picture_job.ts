@@ -1,8 +1,9 @@
 /** A picture in the making: its rays are marched in strips of rows, so that no single call takes long. */
 
 import { type Camera, resized, texelsPerPixel } from './camera.js';
-import type { Device } from './device.js';
+import type { Device, Framebuffer } from './device.js';
 import type { DrawnScene, Shot } from './drawn_scene.js';
+import { ALL_PIXELS, type Following, type Pixels } from './following.js';
 import type { Limits } from './merging.js';
 import type { Setting } from './pace.js';
 import type { Presentation, Target } from './presentation.js';
@@ -35,6 +36,15 @@ export interface Keeping {
   limits?: Limits | null; // with depths, rays seeing so far only
 }
 
+/** How a picture follows the one before, which shows the same at another time. */
+export interface Follows {
+  following: Following;
+  /** What was marched for the picture before, by the names of its shots. */
+  before: ReadonlyMap<string, Target>;
+  /** How many pictures it has followed without a break. */
+  turn: number;
+}
+
 /** A finished picture of a moment, at the camera's size or smaller, and the static part to subtract from it. */
 export interface Picture {
   share: number;
@@ -45,14 +55,20 @@ export interface Picture {
 /** Pixels of a raster with several rays a pixel, at most. */
 const MOST_PIXELS = 1 << 22;
 
+/** A shot, where it is drawn, and a name for it among those of a picture. */
+type PlacedShot = Shot & { name: string; scene: DrawnScene; target: Target; raysAcross: number; share: number };
+
 export class PictureJob {
   readonly view: View;
   readonly setting: Setting;
   readonly role: string;
   /** Seconds that the card has spent on it. */
   seconds = 0;
-  readonly #shots: (Shot & { scene: DrawnScene; target: Target; raysAcross: number; share: number })[];
+  readonly #shots: PlacedShot[];
   readonly #keeping: Keeping;
+  /** Which pixels of each shot are marched, once that is known. */
+  readonly #pixels = new Map<Shot, Pixels>();
+  #follows: Follows | null = null;
   #nextRow = 0;
 
   constructor(view: View, setting: Setting, presentation: Presentation, keeping: Keeping) {
@@ -68,9 +84,9 @@ export class PictureJob {
       const { appearance } = view;
       const background = view.background ?? scene.source.head.background;
       return parts.map((isMoving) => {
-        const name = `${keeping.role} ${number} ${isMoving}`;
-        const target = presentation.target(name, camera.width, camera.height, keeping);
-        return { scene, camera, time, share, quality, isMoving, appearance, background, target, raysAcross };
+        const name = `${number} ${isMoving}`;
+        const target = presentation.target(`${keeping.role} ${name}`, camera.width, camera.height, keeping);
+        return { name, scene, camera, time, share, quality, isMoving, appearance, background, target, raysAcross };
       });
     });
   }
@@ -91,9 +107,19 @@ export class PictureJob {
     return this.#shots.reduce((sum, { target }) => sum + target.height, 0) - this.#nextRow;
   }
 
-  /** What is marched: for each moment the whole scene, its static part, or both. */
-  get targets(): Target[] {
-    return this.#shots.map(({ target }) => target);
+  /** What is marched, by names of shots: for each moment the whole scene, its static part, or both. */
+  get targets(): ReadonlyMap<string, Target> {
+    return new Map(this.#shots.map(({ name, target }) => [name, target]));
+  }
+
+  /** How it follows another picture; null: it is whole. */
+  get follows(): Follows | null {
+    return this.#follows;
+  }
+
+  /** March only what has changed, as far as there is a picture before; called before `march`. */
+  follow(follows: Follows): void {
+    if (this.#shots.some(({ name }) => follows.before.has(name))) this.#follows = follows;
   }
 
   /** March some rows. */
@@ -103,12 +129,27 @@ export class PictureJob {
     for (const shot of this.#shots) {
       const count = Math.min(more, shot.target.height - first);
       if (count > 0) {
-        shot.scene.march(device, shot.target, { ...shot, ...this.#keeping }, first, count);
+        const pixels = this.#pixelsOf(device, shot);
+        shot.scene.march(device, shot.target, { ...shot, ...this.#keeping, pixels }, first, count);
         more -= count;
       }
       first = Math.max(0, first - shot.target.height);
     }
     this.#nextRow += rows - more;
+  }
+
+  #pixelsOf(device: Device, shot: PlacedShot): Pixels {
+    const before = this.#follows?.before.get(shot.name);
+    if (!this.#follows || before?.width !== shot.target.width || before.height !== shot.target.height) {
+      return ALL_PIXELS;
+    }
+    const known = this.#pixels.get(shot);
+    if (known) return known;
+    const { following, turn } = this.#follows;
+    const march = (into: Framebuffer, pixels: Pixels) => shot.scene.march(device, into, { ...shot, pixels });
+    const found = following.findChanges(shot.name, before, turn, LEVELS[this.setting.level].tolerance, march);
+    this.#pixels.set(shot, found);
+    return found;
   }
 
   /** Return the pictures of the moments, once all rows are marched. */

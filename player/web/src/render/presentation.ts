@@ -70,6 +70,11 @@ export class Presentation {
     return target;
   }
 
+  /** Whether a target is kept still. */
+  holds(target: Target): boolean {
+    return [...this.#targets.values()].includes(target);
+  }
+
   /** Write the mean of `raysAcross` x `raysAcross` rays to each pixel of a target. */
   average(marched: Target, target: Target, raysAcross: number): Target {
     const program = this.#program('average.glsl');

@@ -11,13 +11,15 @@ import { type Camera, isSameView, texelsPerPixel } from './camera.js';
 import { contextOf, RenderError } from './context.js';
 import { Device } from './device.js';
 import { DrawnScene } from './drawn_scene.js';
+import { Following } from './following.js';
 import { Merging, type Projection } from './merging.js';
-import { Pace, type Setting } from './pace.js';
+import type { Setting } from './pace.js';
 import { type Keeping, type Moment, type Picture, PictureJob, type ShownPart, type View } from './picture_job.js';
-import { Presentation, type Screen } from './presentation.js';
-import { LEVEL_NAMES, LEVELS, type Level } from './quality.js';
+import { Presentation, type Screen, type Target } from './presentation.js';
+import { FOLLOWING_LEVELS, LEVEL_NAMES, LEVELS, type Level } from './quality.js';
 import type { SceneSource } from './scene_source.js';
 import { SharedPrograms } from './shared_programs.js';
+import { Speed } from './speed.js';
 import { Timer } from './timer.js';
 
 export interface DrawOptions {
@@ -67,16 +69,8 @@ const STILL: Setting = { level: 'fine', scale: 1 };
 const SPARING: Setting = { level: 'fast', scale: 1 };
 /** Seconds that a part of a picture may take, so that the page stays alive and drivers do not think that all hangs. */
 const MOST_SECONDS = 0.25;
-/** Seconds for a ray, until it is known: of a card, and of a processor in its place. */
-const ASSUMED_SECONDS = { card: 2e-7, processor: 1e-5 };
-/** Frames a second that `auto` holds, unless others are asked for. */
-const FPS = { card: 30, processor: 10 };
-/** Rays for a pixel of the first pictures on a card, before it is known how fast it is. */
-export const FIRST_RAYS = 0.1;
 /** Milliseconds of a frame after which programs that are compiled wait for the next one. */
 const TAKING_MS = 4;
-/** How fast what is known of it follows what is measured. */
-const NEW_WEIGHT = 0.5;
 const LIVE = ['live', 'other live'];
 const STILL_ROLE = 'still';
 
@@ -87,20 +81,29 @@ interface Shown {
   setting: Setting;
   role: string;
   pictures: Picture[];
+  /** What was marched for them. */
+  rasters: ReadonlyMap<string, Target>;
+  /** How many pictures it has followed without a break; 0: it is whole. */
+  followed: number;
 }
+
+/** A picture in the making, of what versions of the scenes' planes, and whether others are to follow it at rest. */
+type StartedJob = PictureJob & { versions?: string; isForRest?: boolean };
 
 export class Renderer {
   readonly gl: WebGL2RenderingContext;
-  readonly pace: Pace;
+  readonly #speed: Speed;
   readonly #options: RendererOptions;
   readonly #scenes = new Set<DrawnScene>();
   #device: Device;
   #presentation: Presentation;
+  #following: Following;
   #merging: Merging | null = null;
   #timer: Timer;
   #shown: Shown | null = null;
-  #job: (PictureJob & { versions?: string }) | null = null;
-  #secondsPerRay: number;
+  #job: StartedJob | null = null;
+  /** When the camera came to rest, milliseconds of the clock. */
+  #restsSince = 0;
   #pictures = 0;
   #isDisposed = false;
 
@@ -112,9 +115,9 @@ export class Renderer {
     this.#options = options;
     this.#device = new Device(this.gl, options);
     this.#presentation = new Presentation(this.#device);
+    this.#following = new Following(this.#device);
     this.#timer = new Timer(this.gl, this.isSoftware);
-    this.pace = new Pace(1 / (options.fps ?? this.usualFps), this.isSoftware ? 0 : FIRST_RAYS);
-    this.#secondsPerRay = this.isSoftware ? ASSUMED_SECONDS.processor : ASSUMED_SECONDS.card;
+    this.#speed = new Speed(this.isSoftware, options.fps);
     this.gl.canvas.addEventListener('webglcontextlost', this.#onLost);
     this.gl.canvas.addEventListener('webglcontextrestored', this.#onRestored);
   }
@@ -131,7 +134,12 @@ export class Renderer {
 
   /** Frames a second that `auto` holds unless others are asked for: a processor's would be too coarse at a card's. */
   get usualFps(): number {
-    return this.isSoftware ? FPS.processor : FPS.card;
+    return this.#speed.usualFps;
+  }
+
+  /** Set the frames a second that `auto` holds. */
+  set fps(fps: number) {
+    this.#speed.fps = fps;
   }
 
   /** Whether the browser has taken the card away; it gives it back by itself, and the renderer goes on then. */
@@ -142,6 +150,11 @@ export class Renderer {
   /** Whether there is a picture to present: none after the card was lost, until the next one is whole. */
   get hasPicture(): boolean {
     return !this.isLost && this.#shown !== null;
+  }
+
+  /** Whole pictures that have been shown so far. */
+  get pictures(): number {
+    return this.#pictures;
   }
 
   /** Whether the card is not done yet with the picture before; until then `draw` does nothing. */
@@ -177,7 +190,9 @@ export class Renderer {
   }
 
   removeScene(scene: DrawnScene): void {
-    if (this.#scenes.delete(scene)) scene.release();
+    if (!this.#scenes.delete(scene)) return;
+    if (this.#job?.view.moments.some((moment) => moment.scene === scene)) this.#job = null;
+    scene.release();
   }
 
   /** Have made what `draw` will need for each moment by itself, while planes are to come; return whether it is. */
@@ -201,17 +216,18 @@ export class Renderer {
   draw(camera: Camera, moments: readonly Moment[], options: DrawOptions = {}): DrawnPicture {
     const { level = 'auto' } = options;
     const isAuto = level === 'auto';
-    const wanted = this.#wanted(camera, moments, options);
+    const view = viewOf(camera, moments, options);
+    const restedS = this.#restedS(camera);
+    const wanted = this.#wanted(camera, moments, options, restedS);
     if (this.isLost || this.#timer.isBusy || !this.#hasMemory()) return this.#state(wanted, false);
     for (const scene of this.#scenes) scene.upload(this.#device);
-    const view = viewOf(camera, moments, options);
     const versions = moments.map(({ scene }) => scene.source.version).join();
     const isStill = this.#shown !== null && isSame(this.#shown.view, view);
     const isShown = isStill && this.#shown?.versions === versions;
     if (this.#job?.role === STILL_ROLE && !isSame(this.#job.view, view)) this.#job = null;
+    if (this.#job?.isForRest && !isSameView(this.#job.view.camera, camera)) this.#job = null;
     if (this.#job === null) {
-      const isSharp =
-        isShown && (isAuto ? this.#shown?.setting === this.#still : isSameSetting(this.#shown?.setting, wanted));
+      const isSharp = isShown && (isAuto ? this.#shown?.setting === this.#still : isWhole(this.#shown, wanted));
       if (isSharp) {
         if (options.screen) this.present(options.screen);
         return this.#state(wanted, true);
@@ -221,7 +237,9 @@ export class Renderer {
       const setting = sharpens ? this.#still : wanted;
       if (!this.#isReady(view, setting)) return this.#state(wanted, false);
       this.#job = this.#newJob(view, setting);
+      if (!isAuto || this.#speed.isSettled) this.#letFollow(this.#job);
       this.#job.versions = versions;
+      this.#job.isForRest = this.#speed.isResting(restedS) && FOLLOWING_LEVELS.includes(setting.level);
     }
     this.#goOn(this.#job, isAuto, options.screen ?? null);
     return this.#state(wanted, false);
@@ -242,13 +260,13 @@ export class Renderer {
     const merging = projection && this.#mergingOn(this.#device);
     if (!this.#isReady(views[0], wanted, merging)) return this.#state(wanted, false);
     const isTimed = !this.#timer.isBusy;
-    let cost = 0;
-    if (isTimed) this.#timer.start((seconds) => level === 'auto' && this.pace.record(cost, seconds));
+    let last: PictureJob | null = null;
+    if (isTimed) this.#timer.start((seconds) => level === 'auto' && last && this.#speed.record(last, seconds));
     for (const [number, { screen, projection }] of frames.entries()) {
       const limits = merging && projection && merging.limits(screen, projection);
       const keeping = { role: 'frame', isExact: wanted.level === 'reference', limits };
       const job = new PictureJob(views[number], wanted, this.#presentation, keeping);
-      cost = job.raysPerPixel;
+      last = job;
       job.march(this.#device, job.rowsLeft);
       const pictures = job.finish(this.#presentation);
       if (merging && projection && limits) merging.show(screen, pictures, limits, projection);
@@ -296,7 +314,7 @@ export class Renderer {
       this.#timer.finish();
       await this.#untilIdle();
     }
-    return job.targets.map((target) => {
+    return [...job.targets.values()].map((target) => {
       const [rgba, sums] = [0, 1].map((attachment) => this.#device.read(target, attachment));
       return { width: target.width, height: target.height, rgba, sums };
     });
@@ -317,11 +335,18 @@ export class Renderer {
     return this.#device.isSparing ? SPARING : STILL;
   }
 
-  #wanted(camera: Camera, moments: readonly Moment[], { level = 'auto' }: DrawOptions): Setting {
-    const { source } = moments[0].scene;
-    const wanted = level === 'auto' ? this.pace.setting(texelsPerPixel(source, camera)) : settingOf(level);
+  /** For how many seconds pictures have been those of this camera. */
+  #restedS(camera: Camera): number {
+    const now = performance.now();
+    if (this.#shown === null || !isSameView(this.#shown.view.camera, camera)) this.#restsSince = now;
+    return (now - this.#restsSince) / 1000;
+  }
+
+  #wanted(camera: Camera, moments: readonly Moment[], { level = 'auto' }: DrawOptions, restedS = 0): Setting {
+    const texels = texelsPerPixel(moments[0].scene.source, camera);
+    const wanted = level === 'auto' ? this.#speed.setting(texels, restedS) : settingOf(level);
     const isTooFine = LEVEL_NAMES.indexOf(wanted.level) > LEVEL_NAMES.indexOf(SPARING.level);
-    return this.#device.isSparing && isTooFine ? SPARING : wanted;
+    return this.#device.isSparing && isTooFine ? { ...SPARING } : wanted; // SPARING itself is that of a still picture
   }
 
   /** Whether no compiler keeps a picture waiting. */
@@ -342,15 +367,30 @@ export class Renderer {
     return new PictureJob(view, setting, this.#presentation, keeping(role));
   }
 
+  /**
+   * Let a picture follow the one that is shown, if that is the same at another time. Planes may have arrived in between,
+   * and the scenes be those of another group: what differs is found, and within sixteen pictures all pixels are marched.
+   */
+  #letFollow(job: PictureJob): void {
+    const shown = this.#shown;
+    if (shown === null || job.role === STILL_ROLE || shown.role === STILL_ROLE) return;
+    if (!FOLLOWING_LEVELS.includes(job.setting.level) || !isSameSetting(shown.setting, job.setting)) return;
+    if (!isSameScreen(shown.view, job.view) || isSame(shown.view, job.view)) return;
+    if (!this.#speed.canSample(job) || !this.#following.isReady()) return;
+    const before = new Map([...shown.rasters].filter(([, target]) => this.#presentation.holds(target)));
+    job.follow({ following: this.#following, before, turn: shown.followed });
+  }
+
   /** March as many rows as there is time for, and show the picture if these were the last. */
-  #goOn(job: PictureJob & { versions?: string }, isAuto: boolean, screen: Screen | null): void {
+  #goOn(job: StartedJob, isAuto: boolean, screen: Screen | null): void {
     const isStill = job.role === STILL_ROLE;
-    this.#march(job, isStill ? this.pace.secondsPerFrame : MOST_SECONDS, () => {
-      if (isAuto && !isStill && job.rowsLeft === 0) this.pace.record(job.raysPerPixel, job.seconds);
+    this.#march(job, isStill ? this.#speed.secondsPerFrame : MOST_SECONDS, () => {
+      if (isAuto && !isStill && job.rowsLeft === 0) this.#speed.record(job, job.seconds, job.isForRest);
     });
     if (job.rowsLeft === 0) {
-      const { view, setting, role, versions = '' } = job;
-      this.#shown = { view, setting, role, versions, pictures: job.finish(this.#presentation) };
+      const { view, setting, role, versions = '', follows, targets: rasters } = job;
+      const followed = follows ? follows.turn + 1 : 0;
+      this.#shown = { view, setting, role, versions, rasters, followed, pictures: job.finish(this.#presentation) };
       this.#job = null;
       this.#pictures++;
       this.present(screen);
@@ -362,11 +402,10 @@ export class Renderer {
 
   /** Begin to march the rows that take about so many seconds. */
   #march(job: PictureJob, seconds: number, done: () => void): void {
-    const rays = seconds / this.#secondsPerRay;
-    const rows = Math.min(Math.max(1, Math.floor(rays / job.raysPerRow)), job.rowsLeft);
+    const rows = this.#speed.rows(job, seconds);
     this.#timer.start((took) => {
       job.seconds += took;
-      this.#secondsPerRay += NEW_WEIGHT * (took / (rows * job.raysPerRow) - this.#secondsPerRay);
+      this.#speed.recordRows(job, rows, took);
       done();
     });
     job.march(this.#device, rows);
@@ -396,6 +435,7 @@ export class Renderer {
   #beginAnew(isSparing: boolean): void {
     this.#device = new Device(this.gl, { ...this.#options, isSparing });
     this.#presentation = new Presentation(this.#device);
+    this.#following = new Following(this.#device);
     this.#merging = null;
     this.#timer = new Timer(this.gl, this.isSoftware);
     this.#shown = this.#job = null;
@@ -421,6 +461,7 @@ export class Renderer {
     SharedPrograms.on(this.#device).dispose();
     this.#timer.dispose();
     this.#presentation.release();
+    this.#following.release();
     this.#merging?.release();
     this.#device.dispose();
   }
@@ -434,15 +475,22 @@ function viewOf(camera: Camera, moments: readonly Moment[], options: DrawOptions
 /** Return whether two views show the same, but for planes that have arrived in between. */
 function isSame(a: View, b: View): boolean {
   return (
-    isSameView(a.camera, b.camera) &&
+    isSameScreen(a, b) &&
     a.moments.length === b.moments.length &&
     a.moments.every(({ scene, time }, i) => scene === b.moments[i].scene && time === b.moments[i].time) &&
-    a.part === b.part &&
-    a.appearance === b.appearance &&
-    a.background === b.background
+    a.appearance === b.appearance
   );
+}
+
+/** Return whether two views show the same, but for what happens in the clip. */
+function isSameScreen(a: View, b: View): boolean {
+  return isSameView(a.camera, b.camera) && a.part === b.part && a.background === b.background;
 }
 
 const settingOf = (level: Level | Setting): Setting => (typeof level === 'string' ? { level, scale: 1 } : level);
 
-const isSameSetting = (a: Setting | undefined, b: Setting) => a?.level === b.level && a.scale === b.scale;
+const isSameSetting = (a: Setting, b: Setting) => a.level === b.level && a.scale === b.scale;
+
+/** Whether a picture is as fine as a setting makes it that follows none. */
+const isWhole = (shown: Shown | null, setting: Setting) =>
+  shown?.followed === 0 && isSameSetting(shown.setting, setting);

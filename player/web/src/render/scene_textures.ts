@@ -30,6 +30,9 @@ export const UNIT = {
   otherRgba: 2,
   otherSums: 3,
   limits: 4,
+  sampled: 5,
+  changes: 6,
+  before: 7,
 } as const;
 
 /** What shaders look up of a scene: planes, time rows, displacements and distances to occupied cells. */
@@ -210,6 +213,9 @@ export class Programs {
       cells: UNIT.cells,
       motion: UNIT.motion,
       limits: UNIT.limits,
+      sampled: UNIT.sampled,
+      changes: UNIT.changes,
+      before: UNIT.before,
       nodes: motion?.size ?? [1, 1, 1],
       rows_texel: rows.size.map((side) => 1 / side),
       cell_count: scene.occupancy.sizes.slice(1).reverse(),

@@ -1,0 +1,26 @@
+// Which blocks have changed since a picture: those whose sample pixel differs from it by more than a tolerance, and those
+// with a neighbour whose sample pixel differs by more than twice the tolerance.
+
+#include "follow.glsl"
+
+uniform sampler2D before;   // the picture
+uniform sampler2D sampled;  // the sample pixels now, one of each block
+uniform int turn;
+uniform float tolerance;
+
+out vec4 changed;
+
+float difference_of(ivec2 block) {
+    ivec2 size = textureSize(before, 0);
+    vec4 off = abs(texelFetch(sampled, block, 0) - texelFetch(before, sample_pixel(block, turn, size), 0));
+    return max(max(off.r, off.g), max(off.b, off.a));
+}
+
+void main() {
+    ivec2 block = ivec2(gl_FragCoord.xy), last = textureSize(sampled, 0) - 1;
+    float around = 0.0;
+    for (int i = 0; i < 9; ++i) {
+        around = max(around, difference_of(clamp(block + ivec2(i % 3, i / 3) - 1, ivec2(0), last)));
+    }
+    changed = vec4(max(difference_of(block), 0.5 * around) > tolerance);
+}
