@@ -68,13 +68,14 @@ export class Picture {
   }
 
   /**
-   * Draw what a camera sees of a clip at a time, or go on with that.
+   * Draw what a camera sees of a clip at a time, or go on with that; soon rather than finely if the time was sought.
    * @returns how many pictures have been shown so far, and whether the last one will not become finer by itself.
    */
-  draw(clip: Clip, time: number, camera: Camera, { level, part, appearance }: ShownOptions) {
+  draw(clip: Clip, time: number, camera: Camera, { level, part, appearance }: ShownOptions, hasSought: boolean) {
     return this.#renderer.draw(camera, this.#scenes.moments(clip, time), {
       level,
       part,
+      hasSought,
       appearance: appearanceOf(clip, time, appearance),
     });
   }

@@ -74,6 +74,8 @@ export class Session {
   /** How many wait for a picture, who see it wherever the element is. */
   #askers = 0;
   #isReduced = false;
+  /** Whether a time was sought since the last picture was drawn or gone on with. */
+  #hasSought = false;
   #isSharp = false;
   #isKnownIncomplete = false;
   #request = 0;
@@ -180,6 +182,7 @@ export class Session {
 
   /** Have fetched at once what a time that was sought needs: frames may be late while the card is busy. */
   seek(): void {
+    this.#hasSought = true;
     if (this.clip !== null && this.view !== null) this.#follow(this.clip);
     this.wake();
   }
@@ -317,7 +320,8 @@ export class Session {
       return;
     }
     this.#picture.resize(width, height);
-    const { pictures, isSharp } = this.#picture.draw(clip, time, camera, this.#shownOptions());
+    const { pictures, isSharp } = this.#picture.draw(clip, time, camera, this.#shownOptions(), this.#hasSought);
+    this.#hasSought = false;
     this.pictures = pictures;
     this.#isSharp = isSharp;
     if (clip.scenes.length > 1) this.#picture.prepare(clip, camera, this.#shownOptions());

@@ -31,6 +31,8 @@ export interface DrawOptions {
   appearance?: Float32Array | null;
   /** In place of the scene's. */
   background?: ArrayLike<number> | null;
+  /** Whether another time has been sought since the last call: what is there is to be seen soon, however coarsely. */
+  hasSought?: boolean;
   /** Where to draw, if not over the whole canvas. The camera's size is taken for the size of the picture. */
   screen?: Screen | null;
 }
@@ -217,7 +219,7 @@ export class Renderer {
     const { level = 'auto' } = options;
     const isAuto = level === 'auto';
     const view = viewOf(camera, moments, options);
-    const restedS = this.#restedS(camera);
+    const restedS = this.#restedS(camera, options.hasSought ?? false);
     const wanted = this.#wanted(camera, moments, options, restedS);
     if (this.isLost || this.#timer.isBusy || !this.#hasMemory()) return this.#state(wanted, false);
     for (const scene of this.#scenes) scene.upload(this.#device);
@@ -225,7 +227,7 @@ export class Renderer {
     const isStill = this.#shown !== null && isSame(this.#shown.view, view);
     const isShown = isStill && this.#shown?.versions === versions;
     if (this.#job?.role === STILL_ROLE && !isSame(this.#job.view, view)) this.#job = null;
-    if (this.#job?.isForRest && !isSameView(this.#job.view.camera, camera)) this.#job = null;
+    if (this.#job?.isForRest && restedS === 0) this.#job = null;
     if (this.#job === null) {
       const isSharp = isShown && (isAuto ? this.#shown?.setting === this.#still : isWhole(this.#shown, wanted));
       if (isSharp) {
@@ -335,10 +337,11 @@ export class Renderer {
     return this.#device.isSparing ? SPARING : STILL;
   }
 
-  /** For how many seconds pictures have been those of this camera. */
-  #restedS(camera: Camera): number {
+  /** For how many seconds pictures have been those of this camera, without jumps of the clip. */
+  #restedS(camera: Camera, hasSought: boolean): number {
     const now = performance.now();
-    if (this.#shown === null || !isSameView(this.#shown.view.camera, camera)) this.#restsSince = now;
+    const isSameCamera = this.#shown !== null && isSameView(this.#shown.view.camera, camera);
+    if (!isSameCamera || hasSought) this.#restsSince = now;
     return (now - this.#restsSince) / 1000;
   }
 
