@@ -18,9 +18,10 @@ float difference_of(ivec2 block) {
 
 void main() {
     ivec2 block = ivec2(gl_FragCoord.xy), last = textureSize(sampled, 0) - 1;
-    float around = 0.0;
+    float off = 0.0;
     for (int i = 0; i < 9; ++i) {
-        around = max(around, difference_of(clamp(block + ivec2(i % 3, i / 3) - 1, ivec2(0), last)));
+        ivec2 neighbour = clamp(block + ivec2(i % 3, i / 3) - 1, ivec2(0), last);
+        off = max(off, (neighbour == block ? 1.0 : 0.5) * difference_of(neighbour));
     }
-    changed = vec4(max(difference_of(block), 0.5 * around) > tolerance);
+    changed = vec4(off > tolerance);
 }

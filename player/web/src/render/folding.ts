@@ -20,9 +20,8 @@ export class FoldedPlanes {
   readonly #foldInto: Framebuffer;
   /** Time and version of the folded planes. */
   #folded = '';
-  /** Blocks of the scene that are upsampled, and folded, as they are. */
+  /** Blocks of the scene that are upsampled as they are. */
   readonly #upsampledBlocks = new Set<Block>();
-  readonly #foldedBlocks = new Set<Block>();
   /** The rows that are folded. */
   #foldedRows: Float32Array = new Float32Array(0);
 
@@ -56,7 +55,6 @@ export class FoldedPlanes {
 
   planeChanged(block: Block): void {
     this.#upsampledBlocks.delete(block);
-    this.#foldedBlocks.delete(block);
     this.#folded = '';
   }
 
@@ -73,12 +71,11 @@ export class FoldedPlanes {
         for (const block of changed) this.#upsampledBlocks.add(block);
       }
       const rows = timeRows(scene, layout, time, this.layout.upsampling);
-      const stale = blocks.filter((block) => !this.#foldedBlocks.has(block) || this.#haveChanged(rows, block));
+      const stale = blocks.filter((block) => changed.includes(block) || this.#haveChanged(rows, block));
       this.#device.write(this.#rows, rows);
       this.#device.use(this.#upsampled, UNIT.planes);
       this.#device.use(this.#rows, UNIT.rows);
       this.#drawBlocks(FOLDING[1], this.#foldInto, stale);
-      for (const block of stale) this.#foldedBlocks.add(block);
       this.#foldedRows = rows;
       this.#folded = key;
     }

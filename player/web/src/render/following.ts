@@ -3,13 +3,12 @@
 import { CompiledPrograms } from './compiled.js';
 import type { Device, Format, Framebuffer, Texture } from './device.js';
 import type { Target } from './presentation.js';
+import { BLOCK } from './quality.js';
 import { UNIT } from './scene_textures.js';
 import type { Defines } from './shader.js';
 
 const NAME = 'changes.glsl';
 const DEFINES: Defines = { CONTRACTED: 0, NDC: 0 };
-/** BLOCK of follow.glsl: pixels of a block across. */
-const BLOCK = 4;
 /** Which pixels are marched: `marched` of march.glsl. */
 const MARCHED = { all: 0, sampled: 1, changed: 2 } as const;
 

@@ -18,6 +18,9 @@ export interface Quality {
   tolerance: number;
 }
 
+/** Pixels of a block across, as in follow.glsl. */
+export const BLOCK = 4;
+
 const TERMINATION = 1 / 1024;
 const TOLERANCE = 5 / 255;
 

@@ -14,7 +14,7 @@ import { DrawnScene } from './drawn_scene.js';
 import { Following } from './following.js';
 import { Merging, type Projection } from './merging.js';
 import type { Setting } from './pace.js';
-import { type Keeping, type Moment, type Picture, PictureJob, type ShownPart, type View } from './picture_job.js';
+import { type Moment, type Picture, PictureJob, type ShownPart, type View } from './picture_job.js';
 import { Presentation, type Screen, type Target } from './presentation.js';
 import { FOLLOWING_LEVELS, LEVEL_NAMES, LEVELS, type Level } from './quality.js';
 import type { SceneSource } from './scene_source.js';
@@ -229,16 +229,17 @@ export class Renderer {
     if (this.#job?.role === STILL_ROLE && !isSame(this.#job.view, view)) this.#job = null;
     if (this.#job?.isForRest && restedS === 0) this.#job = null;
     if (this.#job === null) {
-      const isSharp = isShown && (isAuto ? this.#shown?.setting === this.#still : isWhole(this.#shown, wanted));
+      const isSharp = isShown && (isAuto ? this.#shown?.role === STILL_ROLE : isWhole(this.#shown, wanted));
       if (isSharp) {
         if (options.screen) this.present(options.screen);
         return this.#state(wanted, true);
       }
       // What was sharp stays so while more planes arrive.
-      const sharpens = isAuto && (isShown || (isStill && this.#shown?.setting === this.#still));
-      const setting = sharpens ? this.#still : wanted;
+      const sharpens = isAuto && (isShown || (isStill && this.#shown?.role === STILL_ROLE));
+      const still = this.#device.isSparing ? SPARING : STILL;
+      const setting = sharpens ? still : wanted;
       if (!this.#isReady(view, setting)) return this.#state(wanted, false);
-      this.#job = this.#newJob(view, setting);
+      this.#job = this.#newJob(view, setting, sharpens ? STILL_ROLE : this.#freeRole);
       if (!isAuto || this.#speed.isSettled) this.#letFollow(this.#job);
       this.#job.versions = versions;
       this.#job.isForRest = this.#speed.isResting(restedS) && FOLLOWING_LEVELS.includes(setting.level);
@@ -332,11 +333,6 @@ export class Renderer {
     this.#scenes.clear();
   }
 
-  /** What is drawn once all stands still. */
-  get #still(): Setting {
-    return this.#device.isSparing ? SPARING : STILL;
-  }
-
   /** For how many seconds pictures have been those of this camera, without jumps of the clip. */
   #restedS(camera: Camera, hasSought: boolean): number {
     const now = performance.now();
@@ -349,7 +345,7 @@ export class Renderer {
     const texels = texelsPerPixel(moments[0].scene.source, camera);
     const wanted = level === 'auto' ? this.#speed.setting(texels, restedS) : settingOf(level);
     const isTooFine = LEVEL_NAMES.indexOf(wanted.level) > LEVEL_NAMES.indexOf(SPARING.level);
-    return this.#device.isSparing && isTooFine ? { ...SPARING } : wanted; // SPARING itself is that of a still picture
+    return this.#device.isSparing && isTooFine ? SPARING : wanted;
   }
 
   /** Whether no compiler keeps a picture waiting. */
@@ -363,11 +359,13 @@ export class Renderer {
     return areReady.every((isReady) => isReady);
   }
 
-  #newJob(view: View, setting: Setting): PictureJob {
-    const keeping = (role: string): Keeping => ({ role, isExact: setting.level === 'reference' });
-    if (setting === this.#still) return new PictureJob(view, setting, this.#presentation, keeping(STILL_ROLE));
-    const role = this.#shown?.role === LIVE[0] ? LIVE[1] : LIVE[0];
-    return new PictureJob(view, setting, this.#presentation, keeping(role));
+  /** The role of pictures that are drawn beside the one that is shown. */
+  get #freeRole(): string {
+    return this.#shown?.role === LIVE[0] ? LIVE[1] : LIVE[0];
+  }
+
+  #newJob(view: View, setting: Setting, role: string): PictureJob {
+    return new PictureJob(view, setting, this.#presentation, { role, isExact: setting.level === 'reference' });
   }
 
   /**

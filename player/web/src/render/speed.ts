@@ -1,7 +1,7 @@
 /** How fast a device is, as far as pictures have shown, and what it has time for: no WebGL. */
 
 import { costOf, Pace, type Setting } from './pace.js';
-import { FOLLOWING_LEVELS } from './quality.js';
+import { BLOCK, FOLLOWING_LEVELS } from './quality.js';
 
 /** Frames a second that `auto` holds, unless others are asked for. */
 const FPS = { card: 30, processor: 10 };
@@ -22,8 +22,6 @@ const PATIENCE_S = 10;
 const FOLLOWING = { levels: FOLLOWING_LEVELS, upAfter: 20, share: 0.9 };
 /** Seconds that the sample pixels of a picture may take. */
 const MOST_SAMPLING_S = 0.1;
-/** One ray in so many is that of a sample pixel. */
-const PIXELS_A_BLOCK = 16;
 
 /** Pictures that are marched whole, and those that follow another. */
 type Kind = 'whole' | 'following';
@@ -84,7 +82,7 @@ export class Speed {
 
   /** Whether there is time to march the sample pixels of a picture at once. */
   canSample({ raysPerRow, rowsLeft }: Work): boolean {
-    return (raysPerRow * rowsLeft * this.#secondsPerRay.whole) / PIXELS_A_BLOCK < MOST_SAMPLING_S;
+    return (raysPerRow * rowsLeft * this.#secondsPerRay.whole) / BLOCK ** 2 < MOST_SAMPLING_S;
   }
 
   /** Return how many rows of a picture take about so many seconds, of those that are left. */
