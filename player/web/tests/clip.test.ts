@@ -154,6 +154,34 @@ test('the coarse picture comes first, then a finer one, then what is ahead', asy
   });
 });
 
+test('a finer scale is not shown before its time planes are there, so that playing goes on', async () => {
+  const { index } = new Container(LONG);
+  const finer = index.findIndex((entry) => entry.scale === 1);
+  await withServer(LONG, { allowed: index[finer + 3].offset }, async (server) => {
+    await withClip(server.url, {}, async (clip) => {
+      const [stream] = clip.scenes;
+      clip.setPlayhead({ time: 0, rate: 1 });
+      await until(clip, () => clip.canShow(0));
+      const shown: string[] = [];
+      const end = performance.now() + 200; // long enough to decode what has come
+      await until(
+        clip,
+        () => {
+          assert.ok(clip.canShow(0) && clip.buffered[0]?.[1] > 0);
+          return performance.now() > end;
+        },
+        (_, { scale, plane }) => shown.push(`${scale} ${plane}`),
+      );
+      assert.deepEqual([stream.completeScales, shown], [1, ['1 xy', '1 xz']]);
+      server.allowed = Number.MAX_SAFE_INTEGER;
+      await until(clip, () => {
+        assert.ok(clip.canShow(0) && clip.buffered[0][1] > 0);
+        return stream.completeScales === 2;
+      });
+    });
+  });
+});
+
 test('a jump fetches what the picture needs before what lies in between', async () => {
   await withServer(LONG, { rate: 400_000 }, async (server) => {
     await withClip(server.url, {}, async (clip) => {

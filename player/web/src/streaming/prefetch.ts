@@ -67,6 +67,18 @@ export const isNeeded = (segment: Segment, start: number, end: number): boolean 
 export const isWanted = (segment: Segment, { time, isPreview }: Playhead): boolean =>
   !isPreview || (segment.scale === 0 && isNeeded(segment, time, time));
 
+/** Return the times, as pairs in [0, 1], that need none of some segments. */
+export function timesWithout(segments: readonly Segment[]): [number, number][] {
+  const found: [number, number][] = [];
+  let from = 0;
+  for (const { since, until } of [...segments].sort((a, b) => a.since - b.since)) {
+    if (since > from) found.push([from, since]);
+    from = Math.max(from, until);
+  }
+  if (from < 1) found.push([from, 1]);
+  return found;
+}
+
 /** Return how far ahead of the playhead a segment is needed, as a share of the clip; 0 if it is needed now. */
 export function distanceAhead(segment: Segment, { time, loop }: Playhead): number {
   if (isNeeded(segment, time, time)) return 0;

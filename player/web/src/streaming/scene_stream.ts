@@ -27,6 +27,7 @@ import {
   type Segment,
   segmentsOf,
   segmentsToKeep,
+  timesWithout,
 } from './prefetch.js';
 import type { SharedPlanes } from './shared_source.js';
 import { SoundStream } from './sound_stream.js';
@@ -217,9 +218,10 @@ export class SceneStream {
 
   /** Take finished rows of space planes, at most so many bytes or one row. */
   take(mostBytes: number): TexelRows[] {
-    const taken = this.#texels.take(mostBytes, (position) => {
+    const finished = (position: number) => {
       this.#state[position] = State.Held;
-    });
+    };
+    const taken = this.#texels.take(mostBytes, finished, (position) => this.#isEarly(position));
     if (taken.length) {
       this.version++;
       this.#schedule();
@@ -261,10 +263,7 @@ export class SceneStream {
   /** Whether all is held that the scales on the screen, and scale 0 at least, need from `start` to `end`. */
   holds(start: number, end: number): boolean {
     const shown = Math.max(this.completeScales, 1);
-    return this.#segments.every((segment, position) => {
-      const isWanted = this.#keep[position] && segment.scale < shown && isNeeded(segment, start, end);
-      return !isWanted || this.#state[position] === State.Held;
-    });
+    return !this.#lacking(start, end).some(({ scale }) => scale < shown);
   }
 
   /** Whether the picture at a time can be drawn; after a wait, only once the next RESUME_S are there, too. */
@@ -300,17 +299,8 @@ export class SceneStream {
   get buffered(): [number, number][] {
     const complete = this.completeScales;
     if (complete === 0) return [];
-    const gaps = this.#segments
-      .filter((segment, position) => segment.scale < complete && this.#state[position] !== State.Held)
-      .sort((a, b) => a.since - b.since);
-    const found: [number, number][] = [];
-    let from = 0;
-    for (const { since, until } of gaps) {
-      if (since > from) found.push([from, since]);
-      from = Math.max(from, until);
-    }
-    if (from < 1) found.push([from, 1]);
-    return found;
+    const isGap = (position: number) => this.#state[position] !== State.Held;
+    return timesWithout(this.#segments.filter((one, position) => one.scale < complete && isGap(position)));
   }
 
   /** Bytes of the segments of time planes that are held or coming. */
@@ -336,6 +326,20 @@ export class SceneStream {
     for (const request of this.#requests) request.control.abort();
     for (const scale of this.#timePlanes) for (const plane of Object.values(scale)) plane.clear();
     this.#texels.clear();
+  }
+
+  /** Return the segments that are needed from `start` to `end` and still to come. */
+  #lacking(start: number, end: number): Segment[] {
+    const isLacking = (position: number) => this.#keep[position] && this.#state[position] !== State.Held;
+    return this.#segments.filter((one, position) => isLacking(position) && isNeeded(one, start, end));
+  }
+
+  /** Whether a segment is the last space plane of a finer scale, for whose time planes playing would have to wait. */
+  #isEarly(position: number): boolean {
+    const { scale } = this.#segments[position];
+    const { time, rate } = this.#head;
+    const lacking = this.#lacking(time, Math.min(time + rate * RESUME_S, 1)).filter((one) => one.scale === scale);
+    return scale > 0 && lacking.length > 1 && lacking.filter(({ isTime }) => !isTime).length === 1;
   }
 
   #planeOf(number: number): { name: PlaneName; plane: PlaneHead } {

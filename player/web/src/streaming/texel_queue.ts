@@ -25,13 +25,13 @@ export class TexelQueue {
   }
 
   /**
-   * Take rows, at most so many bytes or one row.
+   * Take rows, at most so many bytes or one row, up to a segment that is early.
    * @param finished called with the position of each segment of which these were the last.
    */
-  take(mostBytes: number, finished: (position: number) => void): TexelRows[] {
+  take(mostBytes: number, finished: (position: number) => void, isEarly: (position: number) => boolean): TexelRows[] {
     const taken: TexelRows[] = [];
     let left = mostBytes;
-    while (left > 0 && this.#pieces.length) {
+    while (left > 0 && this.#pieces.length && !isEarly(this.#pieces[0].position)) {
       const piece = this.#pieces[0];
       const { shape, texels, takenRows: firstRow } = piece;
       const length = shape.layers * shape.columns * 4; // halves of a row
