@@ -3,6 +3,7 @@
 import contextlib
 import io
 import shutil
+import threading
 from collections.abc import Callable
 
 import numpy as np
@@ -12,6 +13,7 @@ from kpc.format.common.errors import DisplayError
 from kpc.format.common.images import read_image
 from kpc.format.container import groups
 from kpc.format.container.sources import open_source
+from kpc.format.scene.scene import Scene
 from kpc.player.app import kpplay
 from kpc.player.app import player as player_module
 from kpc.player.app import window as window_module
@@ -21,6 +23,7 @@ from kpc.player.app.preferences import Preferences, preferences_path
 from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.recording import FILM_FPS
 from kpc.player.app.window import Window
+from kpc.player.cpu import loading
 from kpc.player.quality import DEFAULT, neighbouring_level
 from kpc.player.streaming.group_playback import GroupPlayback
 from player_driver import frames_until, press, replaced
@@ -86,6 +89,26 @@ def blended_groups(window: Window, scene_file: str) -> None:
     assert np.abs(player.scene_view.pixels() / 255 - (first + second) / 2).max() < 2 / 255
     player.close()
     stream.close()
+
+
+def a_still_picture_takes_over(window: Window, scene_file: str) -> None:
+    """While nothing changes, too, the panels say that code is being compiled only as long as it is."""
+    may_end = threading.Event()
+
+    def run(self: loading.Loading, scene: Scene) -> None:
+        may_end.wait()
+        self.is_done = True
+
+    with replaced(loading, _begun={}), replaced(loading.Loading, run=run):
+        stream = GroupPlayback(open_source(scene_file))
+        player = Player(window, stream, Preferences())
+        press(player, glfw.KEY_SPACE)
+        frames_until(player, lambda: stream.is_settled and player.snapshot().is_sharp)
+        assert player.scene_view.renderer.is_loading
+        may_end.set()
+        frames_until(player, lambda: not player.scene_view.renderer.is_loading)
+        player.close()
+        stream.close()
 
 
 def defaults_on_a_graphics_card(window: Window, scene_file: str) -> None:

@@ -27,6 +27,7 @@ from kpc.player.quality import DEFAULT, neighbouring_level
 from kpc.player.streaming.group_playback import GroupPlayback
 from player_driver import drag, exact_picture, frames_until, press, replaced
 from player_windows import (
+    a_still_picture_takes_over,
     blended_groups,
     defaults_on_a_graphics_card,
     groups_of_a_clip,
@@ -66,6 +67,7 @@ def main(scene_file: str) -> None:
     resized_and_closed(player)
     groups_of_a_clip(window, scene_file)
     blended_groups(window, scene_file)
+    a_still_picture_takes_over(window, scene_file)
     defaults_on_a_graphics_card(window, scene_file)
     stream.close()
     window.close()

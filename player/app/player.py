@@ -170,7 +170,7 @@ class Player:
             shown += stream.is_settled
 
     def _wait(self) -> None:
-        """Wait for events; show a frame if there are any, or there were a moment ago, or a message disappears.
+        """Wait for events; show a frame if there are any, or were a moment ago, a message disappears, or code loads.
 
         ImGui reacts to an event over several frames, say with a tooltip.
         """
@@ -181,7 +181,7 @@ class Player:
             self.frame()
             return
         glfw.wait_events_timeout(min(until_gone, SLEEP_S) if until_gone > 0 else SLEEP_S)
-        if self.window.is_stirred or 0 < until_gone < SLEEP_S:
+        if self.window.is_stirred or 0 < until_gone < SLEEP_S or self.scene_view.renderer.is_loading:
             self.frame()
 
     def frame(self, seconds: float | None = None) -> None:

@@ -107,6 +107,8 @@ class SceneView:
             return True
         elif not self.is_sharp and now - self._changed_at > REFINE_AFTER_S:
             self._refine()
+        elif self.is_sharp:
+            self._take_over()
         return False
 
     @property
@@ -133,6 +135,9 @@ class SceneView:
         self.raster = (width, height)
         # Resizing the canvas's camera keeps the field of view, however the sides of the raster are rounded.
         self._show(self.canvas, self.state.view.camera(*self.canvas.size).resized(width, height))
+        self._take_over()
+
+    def _take_over(self) -> None:
         if self.renderer.take_over():
             self.state.quality.resolution.forget()
 
