@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import shutil
 import threading
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from kpc.player.app import player as player_module
 from kpc.player.app import window as window_module
 from kpc.player.app.desktop import glfw
 from kpc.player.app.player import Player
-from kpc.player.app.preferences import Preferences, preferences_path
+from kpc.player.app.preferences import Preferences, load, preferences_path
 from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.recording import FILM_FPS
 from kpc.player.app.window import Window
@@ -156,10 +157,12 @@ def reset_of_the_graphics_card(scene_file: str) -> None:
 def settings_are_saved(scene_file: str) -> None:
     """Settings of one run hold in the next unless an option replaces them; an error in saving them is reported."""
     settings: list[Preferences] = []
+    recent: list[tuple[str, ...]] = []
 
     def run(player: Player, frames: int | None = None) -> None:
         player.frame()
         settings.append(player.preferences())
+        recent.append(load(preferences_path()).recent)
         press(player, "-", "g")
 
     with replaced(Player, run=run):
@@ -171,6 +174,7 @@ def settings_are_saved(scene_file: str) -> None:
         shutil.rmtree(preferences_path().parent)
         preferences_path().parent.write_text("not a folder")
         assert kpplay.main([scene_file]) == 0
+    assert recent == [(os.path.abspath(scene_file),)] * 3 + [()]
     assert [one.size for one in settings[:3]] == [(640, 480)] * 3
     assert [one.graphs for one in settings] == [False, True, False, False]
     assert [one.quality for one in settings] == [DEFAULT, neighbouring_level(DEFAULT, -1), "fine", DEFAULT]

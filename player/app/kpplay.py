@@ -15,6 +15,8 @@ import argparse
 import os
 import re
 import sys
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -74,12 +76,16 @@ def _command(argv: list[str]) -> None:
     playlist = Playlist.named(options.scenes, settings.recent)
     stream = GroupPlayback(open_source(playlist.files[0], limit=options.memory), memory=options.memory)
     failures: list[str] = []
-    last_settings = _play(stream, settings, options, path, playlist, failures)
-    if file is not None:
-        try:
-            preferences.save(last_settings, file)
-        except OSError as error:
-            notice(f"kpplay: settings were not saved: {file}: {error.strerror or error}")
+
+    def save(settings: Preferences) -> None:
+        if file is not None:
+            preferences.save(settings, file)
+
+    last_settings = _play(stream, settings, options, path, playlist, failures, save)
+    try:
+        save(last_settings)
+    except OSError as error:
+        notice(f"kpplay: settings were not saved: {file}: {error.strerror or error}")
     if failures:
         raise KpcError(f"loading stopped: {'; '.join(failures)}")
 
@@ -168,10 +174,12 @@ def _play(
     path: CameraPath | None,
     playlist: Playlist,
     failures: list[str],
+    save: Callable[[Preferences], None],
 ) -> Preferences:
     """Play the scene and others that are opened in the window; return the settings to save.
 
-    Why the loading of a scene stopped is added to `failures`.
+    Recent files are saved when they are opened, since a player may be killed. Why the loading of a scene stopped is
+    added to `failures`.
     """
     # Imported here so that a scene that cannot be read is reported without a display.
     from kpc.player.app.player import Player
@@ -185,6 +193,8 @@ def _play(
         while True:
             name, is_remote = stream.source.name, isinstance(stream.source, RemoteSource)
             playlist.opened(file, name if is_remote else os.path.abspath(name))
+            with suppress(OSError):  # which is reported at the end
+                save(replace(settings, recent=playlist.recent))
             window.set_title(_title(stream.metadata.title, playlist))
             player = Player(
                 window, stream, settings, resume_from=interrupted, folder=Path(options.folder or "."), playlist=playlist
