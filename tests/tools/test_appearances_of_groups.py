@@ -43,7 +43,7 @@ def test_groups_without_appearances_show_their_average_which_is_said_once(
     frames = tmp_path / "frames"
     assert render(mixed, "cam2", frames, "--step", "8") == 0
     err = capsys.readouterr().err
-    assert err.count("--appearance cam2: shows the average in 1 of 3 groups, which has no appearances") == 1
+    assert err.count("kprender: --appearance cam2: shows the average in 1 of 3 groups, which has no appearances") == 1
     clip = kpc.load(mixed)
     for number in (0, 16, 32):
         scene, time = clip.at(number / 32)

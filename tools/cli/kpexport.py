@@ -130,7 +130,7 @@ def _renderer(loaded: Scene | GroupedScene, shots: Shots, options: argparse.Name
     """Return a function that renders the scene over black."""
     black = {"content": None, "part": Part.FULL, "background": np.zeros(3, np.float32)}
     chosen = {name: getattr(options, name) for name in ("backend", "quality", "appearance")}
-    render, name = renderer_of(loaded, argparse.Namespace(**black, **chosen), shots.times())
+    render, name = renderer_of(loaded, argparse.Namespace(**black, **chosen), shots.times(), _say)
     _say(name)
     return render
 

@@ -64,7 +64,7 @@ def _command(argv: list[str]) -> None:
     has_times = options.time is not None or any(shots.time(number) for number in shots.numbers)
     if options.cameras and loaded.clip.frame_count > 1 and not has_times:
         _say(f"{options.cameras}: all views are at the beginning of the clip; --time chooses another time")
-    render, renderer = renderer_of(loaded, options, shots.times())
+    render, renderer = renderer_of(loaded, options, shots.times(), _say)
     _say(renderer)
 
     def picture(number: int) -> Rendering:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from kpc.format.common.errors import UsageError
-from kpc.format.common.text import agreeing, counted, notice
+from kpc.format.common.text import agreeing, counted
 from kpc.format.container.groups import GroupedScene
 from kpc.format.scene.scene import Scene, common_names
 
@@ -15,10 +15,12 @@ from kpc.format.scene.scene import Scene, common_names
 Chosen = Callable[[Scene], np.ndarray | None]
 
 
-def appearance_in(loaded: Scene | GroupedScene, text: str | None, times: Iterable[float]) -> Chosen:
+def appearance_in(
+    loaded: Scene | GroupedScene, text: str | None, times: Iterable[float], say: Callable[[str], None]
+) -> Chosen:
     """Return what --appearance chooses in each scene that is shown at these times; the average without the option.
 
-    Groups without any appearance are rendered with their average among others that have some, and that is said once.
+    Groups without any appearance are rendered with their average among others that have some; `say` is told so once.
 
     Raises:
         UsageError: the appearance is not in all groups that have any, or a share lies outside [0, 1].
@@ -45,7 +47,7 @@ def appearance_in(loaded: Scene | GroupedScene, text: str | None, times: Iterabl
         raise UsageError(f"{error}{'; other names are in some groups only' if is_partial else ''}") from error
     if bare:
         where = f"{bare} of {counted(len(known), 'group')}, which {agreeing(bare, 'has', 'have')} no appearances"
-        notice(f"--appearance {text}: shows the average in {where}")
+        say(f"--appearance {text}: shows the average in {where}")
     return chosen
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from kpc.format.common.errors import UsageError
 from kpc.format.common.images import linear_from_srgb, srgb_from_linear
 from kpc.format.common.progress import in_parts, part
+from kpc.format.common.text import notice
 from kpc.format.container.groups import GroupedScene
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
@@ -30,16 +31,19 @@ Draw = Callable[[Scene, Camera, float, Sequence[Scene]], Rendering]
 
 
 def renderer_of(
-    loaded: Scene | GroupedScene, options: argparse.Namespace, times: Iterable[float]
+    loaded: Scene | GroupedScene,
+    options: argparse.Namespace,
+    times: Iterable[float],
+    say: Callable[[str], None] = notice,
 ) -> tuple[Render, str]:
     """Return a function that renders a picture over the background of the options, and the name of the renderer.
 
     With a transparent background colours are multiplied by opacity. The appearance of the options is looked for in all
-    that is shown at these times before anything is rendered.
+    that is shown at these times before anything is rendered; `say` is told what users should know of it.
     """
     if options.backend == "reference" and options.quality != "reference":
         raise UsageError(f"--quality {options.quality}: is of the gl backend; leave it out, or --backend reference")
-    chosen = appearance_in(loaded, options.appearance, times)
+    chosen = appearance_in(loaded, options.appearance, times, say)
     make_drawing = _reference_drawing if options.backend == "reference" else _gl_drawing
     draw, name = make_drawing(options, chosen)
     needed: list[Scene] = []
