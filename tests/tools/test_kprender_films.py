@@ -260,6 +260,14 @@ def test_resuming_with_other_options_is_refused(
     assert not (tmp_path / "out" / "0002.png").exists()
 
 
+def test_resuming_in_another_format_names_the_format(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    for before, now in (("exr", "png"), ("jpg", "exr")):  # whose backgrounds differ where none is given
+        words = [scene_file, *SIZE, "--frames", "0-0", "-o", tmp_path / before]
+        assert run(*words, "--format", before)[0] == 0
+        code, _, printed = run(*words, "--format", now, "--resume")
+        assert code == 2 and f"another value of --format ({before}, now {now})" in printed
+
+
 def test_resuming_knows_a_scene_by_its_content_and_keeps_no_secret(run: Run, scene_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert run(scene_file, *SIZE, "--frames", "0-0", "-o", out)[0] == 0

@@ -72,10 +72,14 @@ def _begin(folder: Path, options: argparse.Namespace, now: dict[str, Any], paths
         changed = [name for name in now if _identity(before.get(name)) != _identity(now[name])]
         if changed and options.resume:
             name = changed[0]
-            what = NAMES.get(name, "--" + name.replace("_", "-"))
+            what, was, given = NAMES.get(name, "--" + name.replace("_", "-")), before.get(name), now[name]
+            kinds, asked = ({Path(one).suffix[1:] for one in some} for some in (_pictures(folder), names))
+            by_format = (None, "transparent"), ("transparent", None)  # where --background is not given
+            if name == "background" and (was, given) in by_format and "exr" in kinds ^ asked:
+                what, was, given = "--format", " and ".join(sorted(kinds)), " and ".join(asked)
             raise UsageError(
                 f"--resume: the pictures in {folder} were rendered with another value of {what} "
-                f"({_shown(before.get(name))}, now {_shown(now[name])}); give the same, or another folder with -o"
+                f"({_shown(was)}, now {_shown(given)}); give the same, or another folder with -o"
             )
         unknown = set(map(str, found)) if isinstance(found := before.get(UNKNOWN), list) else set()
         if lying := sorted(path.name for path in paths if path.name in unknown and path.exists() and options.resume):
