@@ -115,6 +115,7 @@ def test_help_needs_no_extra_or_says_which(call: str) -> None:
         ("zstandard", "commands.kpbench", "codec x.kpck", "bench"),
         ("av", "commands.kpbench", "quality x.kpc set", "encoder"),
         ("numba", "commands.kpbench", "encode set", "encoder"),
+        ("numba", "commands.kpbench", f"stream {SAMPLE}", "encoder"),
     ],
 )
 def test_what_is_missing_is_named_in_one_line(

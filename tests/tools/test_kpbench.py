@@ -300,11 +300,24 @@ def test_records_before_a_failure_are_kept(
     gl.context()
     monkeypatch.setattr(harness, "isolated", lambda work, job: work(job))
     good, bad = tiny_file(tmp_path / "good.kpc", False), tmp_path / "bad.kpc"
-    bad.write_bytes(b"nonsense")
+    bad.write_bytes(good.read_bytes()[:-1] + b"x")
     assert kpbench.main(["player", str(good), str(bad), "--size", "8x6", "--frames", "1"]) == 1
     output = capsys.readouterr()
     assert [record["name"] for record in json.loads(output.out)] == ["good"] * len(LEVELS)
     assert output.err.splitlines()[-1].startswith(f"kpbench: {bad}: ")
+
+
+@pytest.mark.parametrize("kind", ["codec", "entropy", "decode", "player", "stream", "window", "steady", "web"])
+@pytest.mark.parametrize("wrong", ["none.kpc", "bad.kpc"])
+def test_all_scenes_are_looked_at_before_the_first_is_measured(
+    kind: str, wrong: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, bad = tiny_file(tmp_path / "good.kpc", False), tmp_path / wrong
+    if wrong == "bad.kpc":
+        bad.write_bytes(b"nonsense")
+    assert kpbench.main([kind, str(good), str(bad)]) in (1, 2)
+    output = capsys.readouterr()
+    assert output.out == "" and output.err.startswith(f"kpbench: {bad}: ") and output.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("minutes", ["", "0", "-1", "nan", "inf", "1,,2", "soon"])

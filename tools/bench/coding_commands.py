@@ -22,7 +22,7 @@ def add_parsers(kinds: Any) -> None:
         description="Code each scene at several rates, and its planes with general-purpose codecs; see "
         "kpc.tools.bench.baselines. With --out FILE.json also write FILE.csv and FILE.svg.",
     )
-    harness.add_scenes(codec, help="finished checkpoints (kpenc --keep-checkpoint) or .kpc files")
+    harness.add_scenes(codec, "finished checkpoints (kpenc --keep-checkpoint) or .kpc files", _look)
     codec.add_argument(
         "--dataset",
         type=cli.named_path,
@@ -62,16 +62,23 @@ def add_parsers(kinds: Any) -> None:
     decode.set_defaults(measure=_decode)
 
 
+def _look(source: Path) -> None:
+    """Raise an error if a package is missing, or a file is neither a checkpoint nor a .kpc file."""
+    harness.encoder()
+    from kpc.tools.bench import codec_bench  # needs scipy
+
+    codec_bench.codec_model.is_coded(source)
+
+
 def _codec(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
     """Yield a record for each scene and coder.
 
     Beside --out FILE.json, FILE.csv holds all points and FILE.svg shows the curves. FILE.NAME.points holds the points
     of a scene measured so far, from which an interrupted benchmark goes on; it is deleted at the end.
     """
-    harness.encoder()  # reports a missing package before anything is read
     from kpc.tools.bench import codec_bench  # needs scipy
 
-    folders: list[Path | None] = options.dataset or [None] * len(options.scenes)
+    folders: list[Path | None] = [*map(harness.existing_folder, options.dataset or ())] or [None] * len(options.scenes)
     if len(folders) != len(options.scenes):
         raise UsageError(
             f"--dataset is given {len(folders)} times for {len(options.scenes)} scenes; name one for each, or none"
@@ -83,7 +90,7 @@ def _codec(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
     for source, folder in zip(options.scenes, folders, strict=True):
         views = "its own validation rays"
         if folder is not None:
-            views = f"held-out views of {harness.existing_folder(folder).resolve().name}"
+            views = f"held-out views of {folder.resolve().name}"
         settings = {"evaluated_on": views, "processes": options.processes}
         record = harness.new_record("codec", source, origin, settings)
         print(f"kpbench: {record['name']}, evaluated on {views}", file=sys.stderr)

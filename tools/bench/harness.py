@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 from kpc.format.common import cli
 from kpc.format.common.errors import KpcError, UsageError
+from kpc.format.container.container import Reader
 from kpc.tools.bench.provenance import data_hash
 from kpc.tools.bench.records import Record
 from kpc.tools.dev.processes import end_with_parent
@@ -79,8 +80,11 @@ def size_text(size: tuple[int, int]) -> str:
 # --- the command line
 
 
-def add_scenes(parser: argparse.ArgumentParser, help: str = ".kpc files") -> None:
-    """Add the positional argument SCENE..."""
+def add_scenes(
+    parser: argparse.ArgumentParser, help: str = ".kpc files", look: Callable[[Path], object] = Reader
+) -> None:
+    """Add the positional argument SCENE...; `look` raises an error for what is none, before anything is measured."""
+    parser.set_defaults(look=look)
     parser.add_argument("scenes", type=cli.named_path, nargs="+", metavar="SCENE", help=help)
 
 

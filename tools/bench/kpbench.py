@@ -65,6 +65,8 @@ def _command(argv: list[str]) -> None:
     out: Path | None = options.out
     if out is not None:
         cli.check_writable(out, option="--out")
+    for scene in getattr(options, "scenes", ()):
+        options.look(scene)
     records: list[Record] = []
     try:
         for record in options.measure(options, origin):

@@ -126,6 +126,8 @@ def _player(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
 
 def _stream(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
     """Yield one record per scene: when it appears from disk and over a slow link, and the quality of its prefixes."""
+    import kpc.encoder.coding.scene_writer  # noqa: F401  # reports a missing package before anything is measured
+
     for source in options.scenes:
         settings = {"size": size_text(options.size), "rate": streaming_bench.RATE, "delay": streaming_bench.DELAY}
         job = streaming_bench.Loading(source, options.size, LEVELS[DEFAULT])
