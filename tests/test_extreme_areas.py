@@ -1,11 +1,10 @@
 """Scales of what moves at the extremes, against float64: areas that touch, nest, reach the ends of the box or hold
 nothing, none to eight of them, and log densities that add up to the limit."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
+import decoder  # the readable one, which computes in float64
 import numpy as np
 import pytest
 import torch
@@ -23,10 +22,6 @@ from kpc.player.cpu import reference
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LEVELS, Quality
 from scenes import tiny_scene
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "spec"))  # the readable decoder, which computes in float64
-
-import decoder
 
 CHANNELS, RESOLUTION, ROWS = 4, (12, 10, 8), 4
 TIME = 0.3

@@ -4,12 +4,16 @@ import dataclasses
 import hashlib
 import json
 import struct
-import sys
 from pathlib import Path
 
+import decoder.__main__
+import decoder.trace
 import numpy as np
 import pytest
 import zstandard
+from decoder.common import crc32c
+from decoder.container import ENTRY, HEADER
+from decoder.entropy import EntropyDecoder
 
 from kpc.encoder.coding import scene_writer
 from kpc.format.coding.quantise import quantise_scene
@@ -21,13 +25,6 @@ from kpc.tools.vectors.description import ZSTD_VERSION, described
 from scenes import VARIANTS, tiny_scene
 
 SPEC = Path(__file__).parent.parent / "spec"
-sys.path.insert(0, str(SPEC))  # the readable decoder is no part of the package
-
-import decoder.__main__  # noqa: E402
-import decoder.trace  # noqa: E402
-from decoder.common import crc32c  # noqa: E402
-from decoder.container import ENTRY, HEADER  # noqa: E402
-from decoder.entropy import EntropyDecoder  # noqa: E402
 
 VECTORS = SPEC / "vectors"
 MANIFEST = json.loads((VECTORS / "manifest.json").read_text())

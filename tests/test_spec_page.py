@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from decoder import container, trace, transform
 
 from kpc.encoder.coding import rans
 from kpc.format.coding import poses
@@ -16,9 +17,6 @@ from kpc.format.core import decoding
 from kpc.format.scene import scene, sound, space
 
 SPEC = Path(__file__).parent.parent / "spec"
-sys.path.insert(0, str(SPEC))  # the readable decoder is no part of the package
-
-from decoder import container, trace, transform  # noqa: E402
 
 PAGE = (SPEC / "kpc-format.md").read_text()
 LINES = PAGE.splitlines()

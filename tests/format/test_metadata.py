@@ -4,12 +4,12 @@ import argparse
 import copy
 import json
 import re
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from decoder import Refused
+from decoder.metadata import decode_metadata
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -31,11 +31,6 @@ from kpc.format.scene.metadata import (
 )
 from kpc.tools.vectors.metadata_vectors import FULL
 from scenes import tiny_scene
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "spec"))  # the readable decoder is no part of the package
-
-from decoder import Refused
-from decoder.metadata import decode_metadata
 
 METADATA = Metadata(FULL)
 

@@ -1,7 +1,6 @@
 """TRANSFORM in integers: near to exact cosines, the same comes back, and damage is refused."""
 
 import importlib
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -30,21 +29,13 @@ from kpc.format.container import segments
 from kpc.format.container.container import Codec
 from kpc.format.container.segments import WEIGHT_COUNT, PredictionWeights
 
-SPEC = Path(__file__).parents[2] / "spec"
 SIZES = ((4, 1, 1), (4, 9, 30), (8, 4, 5), (8, 37, 50), (16, 20, 35), (16, 8, 8))
 
 
 @pytest.fixture(scope="module")
 def twin() -> ModuleType:
     """Return the readable decoder in spec/, with a function that decodes a segment under TRANSFORM."""
-    import sys
-
-    sys.path.insert(0, str(SPEC))
-    try:
-        module = importlib.import_module("decoder.planes")
-    finally:
-        sys.path.remove(str(SPEC))
-    return module
+    return importlib.import_module("decoder.planes")
 
 
 def float_symbols(blocks: TransformBlocks, coded: np.ndarray) -> np.ndarray:
