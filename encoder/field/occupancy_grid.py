@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from kpc.encoder.field.random_points import random_points
 from kpc.format.scene.grid import SPACE_TIME_AXES, dilate
 
 # Share of cells by which merging time slots may raise the mean occupancy.
@@ -14,6 +15,9 @@ MERGE_TOLERANCE = 0.1
 
 # What `OccupancyGrid.marched` holds of cells in which rays take every STRIDE-th sample only, for as many steps.
 STRIDED, STRIDE = 2, 4
+
+# A cell is 1 if it is occupied, and STRIDED more if it is kept; none is this.
+NO_CODE = 255
 
 # A function of (N, 3) float32 points in [0, 1]^3 and (N,) float32 times that returns (N,) log densities.
 DensityAt = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -52,10 +56,8 @@ class OccupancyGrid:
         peak: (Nz, Ny, Nx) float32, decaying maximum of the weights of training rays in a cell.
         occupied: (Nz, Ny, Nx) bool.
         kept: (Nz, Ny, Nx) bool, cells that are occupied in any case; None for none.
-        active: (slots, Nz, Ny, Nx) bool, the occupied cells where rays take samples in each time slot; one slot until
-            `split`.
-        marched: (slots, Nz, Ny, Nx) uint8, `active` as rays of training take it: STRIDED where nothing but `kept` says
-            that a cell is occupied.
+        marched: (slots, Nz, Ny, Nx) uint8, 1 where rays of training take samples in each time slot, STRIDED where
+            nothing but `kept` says that a cell is occupied; one slot until `split`.
     """
 
     # Subtracted from the log density at each update.
@@ -81,7 +83,12 @@ class OccupancyGrid:
         self.kept: np.ndarray | None = None
         self._dense = np.ones((1, *visible.shape), bool)
         self._is_sampled = False
-        self._activate()
+        self._activate_all()
+
+    @property
+    def active(self) -> np.ndarray:
+        """The occupied cells where rays take samples in each time slot, (slots, Nz, Ny, Nx) bool."""
+        return self.marched > 0
 
     def restrict(self, cells: np.ndarray) -> None:
         """Let no cells be occupied but these, (Nz, Ny, Nx) bool."""
@@ -107,11 +114,8 @@ class OccupancyGrid:
             chosen = matters & (self.occupied | (rng.random(self.visible.shape, dtype=np.float32) < 1 / 16))
         self._is_sampled = True
         self.log_density -= self.DENSITY_DECAY
-        cells = np.argwhere(chosen)
-        for _ in range(self.SAMPLES):
-            self.log_density[chosen] = np.maximum(
-                self.log_density[chosen], self._sample(density_at, cells, rng, 0.0, 1.0)
-            )
+        cells, known = np.flatnonzero(chosen), self.log_density.reshape(-1)
+        known[cells] = np.maximum(known[cells], self._sample(density_at, cells, rng, self.SAMPLES, 0.0, 1.0))
         self._found = matters & (self.log_density > self._density_threshold())
         self._activate()
 
@@ -119,18 +123,30 @@ class OccupancyGrid:
         """Restrict active cells, in each of `slots` equal parts of the clip, to where density is close by.
 
         What moves fills at each instant a small part of the cells that it ever fills. Close by means in the same or a
-        neighbouring slot and cell, so that displacements can go on changing until the next split.
+        neighbouring slot and cell, so that displacements can go on changing until the next split; with so many
+        neighbours one sample of each is enough.
         """
-        self._dense = dilate(self.sample_slots(density_at, rng, slots, self.SAMPLES), SPACE_TIME_AXES)
+        self._dense = dilate(self.sample_slots(density_at, rng, slots, 1), SPACE_TIME_AXES)
+        self._activate_all()
+
+    def _activate_all(self) -> None:
+        """Set `occupied` and `marched` of all cells."""
+        self._codes = np.full(self.visible.size, NO_CODE, np.uint8)
+        self.marched = np.zeros(self._dense.shape, np.uint8)
         self._activate()
 
     def _activate(self) -> None:
-        """Set `active` to the cells that are occupied and hold density, and `kept`."""
-        self.occupied, self.active = self._found, self._found & self._dense
-        self.marched = self.active.astype(np.uint8)
+        """Set `occupied`, and `marched` of the cells for which it changes: those that are occupied and hold density,
+        and `kept`."""
+        codes = self._found.astype(np.uint8).reshape(-1)
         if self.kept is not None:
-            self.marched[~self.active & self.kept] = STRIDED
-            self.occupied, self.active = self._found | self.kept, self.active | self.kept
+            codes += np.uint8(STRIDED) * self.kept.reshape(-1)
+        self.occupied = (codes > 0).reshape(self.visible.shape)
+        cells = np.flatnonzero(codes != self._codes)
+        self._codes, changed = codes, codes[cells]
+        slots = len(self._dense)
+        holds = self._dense.reshape(slots, -1)[:, cells] & (changed & 1).astype(bool)
+        self.marched.reshape(slots, -1)[:, cells] = np.where(holds, np.uint8(1), changed & np.uint8(STRIDED))
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint holds of this grid."""
@@ -149,21 +165,29 @@ class OccupancyGrid:
             self.kept = None
         names = ("log_density", "peak", "occupied", "dense")
         self.log_density, self.peak, self._found, self._dense = (state[name].cpu().numpy() for name in names)
-        self._activate()
+        self._activate_all()
         self._is_sampled = bool(state["known"])
 
     def _density_threshold(self) -> float:
         """Return the threshold of log density, at most the mean: an empty grid could never fill again."""
         known = self.log_density[self.visible]
+        if len(known) and known.max() - math.log(len(known)) > self.threshold:  # so is the mean
+            return self.threshold
         return min(self.threshold, math.log(max(float(np.exp(known.astype(np.float64)).mean()), 1e-30)))
 
     def _sample(
-        self, density_at: DensityAt, cells: np.ndarray, rng: np.random.Generator, start: float, end: float
+        self, density_at: DensityAt, cells: np.ndarray, rng: np.random.Generator, samples: int, start: float, end: float
     ) -> np.ndarray:
-        """Return log densities at a random point of each cell and a random time in [start, end]."""
-        points = (cells + rng.random(cells.shape, dtype=np.float32)) / np.array(self.visible.shape, np.float32)
-        times = start + (end - start) * rng.random(len(cells), dtype=np.float32)
-        return density_at(np.ascontiguousarray(points[:, ::-1], np.float32), times.astype(np.float32))
+        """Return the largest of some log densities, each at a random point of a cell and a random time in [start, end].
+
+        Args:
+            cells: (n,) int64, numbers of cells in a flat grid. samples: of each cell.
+        """
+        best = np.full(len(cells), -np.inf, np.float32)
+        for _ in range(samples):
+            seed = rng.integers(1 << 64, dtype=np.uint64)
+            np.maximum(best, density_at(*random_points(cells, self.visible.shape, start, end, seed)), out=best)
+        return best
 
     def sample_slots(
         self, density_at: DensityAt, rng: np.random.Generator, slots: int, samples: int = 16
@@ -172,11 +196,9 @@ class OccupancyGrid:
 
         Each occupied cell is sampled `samples` times in each slot.
         """
-        cells, least = np.argwhere(self.occupied), self._density_threshold()
-        out = np.zeros((slots, *self.visible.shape), bool)
+        cells, least = np.flatnonzero(self.occupied), self._density_threshold()
+        out = np.zeros((slots, self.visible.size), bool)
         for slot in range(slots):
-            best = np.full(len(cells), -np.inf, np.float32)
-            for _ in range(samples):
-                best = np.maximum(best, self._sample(density_at, cells, rng, slot / slots, (slot + 1) / slots))
-            out[slot][self.occupied] = best > least
-        return out
+            found = self._sample(density_at, cells, rng, samples, slot / slots, (slot + 1) / slots)
+            out[slot, cells] = found > least
+        return out.reshape(slots, *self.visible.shape)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from kpc.encoder.field.occupancy_grid import MERGE_TOLERANCE, STRIDED, OccupancyGrid, grid_shape, merge_slots
+from kpc.encoder.field.random_points import random_points
 from kpc.format.scene.grid import SPACE_TIME_AXES, dilate
 
 SHAPE = (6, 5, 8)
@@ -202,3 +203,34 @@ def test_kept_cells_that_nothing_else_occupies_are_marched_with_a_stride() -> No
     again.kept = g.kept
     again.load(g.state())
     np.testing.assert_array_equal(again.marched, g.marched)
+
+
+def test_what_changes_leaves_the_grid_as_if_all_cells_were_set_anew() -> None:
+    """Density moves on while cells are kept and given up, and slots are split."""
+    g, rng = grid(), np.random.default_rng(0)
+    g.kept = ball(np.argwhere(np.ones(SHAPE)) / SHAPE, np.zeros(0)).reshape(SHAPE) > 0
+    for number in range(120):
+        if number == 50:
+            g.split(moving, 4, rng)
+        if number == 80:
+            g.kept = None
+        g.update(moving if number < 60 else corner, np.ones(SHAPE, np.float32), rng)
+        again = grid()
+        again.kept = None if g.kept is None else g.kept.copy()
+        again.load(g.state())
+        for name in ("occupied", "active", "marched"):
+            np.testing.assert_array_equal(getattr(g, name), getattr(again, name))
+    assert 0 < g.occupied.mean() < 1
+
+
+def test_random_points_fill_their_cells_and_depend_on_nothing_but_the_seed() -> None:
+    cells, seed = np.random.default_rng(0).integers(0, 240, 20_000), np.uint64(2**63 + 5)
+    points, times = random_points(cells, SHAPE, 0.25, 0.5, seed)
+    z, y, x = np.unravel_index(cells, SHAPE)
+    inside = np.c_[points * [8, 5, 6] - np.c_[x, y, z], 4 * times - 1]
+    assert inside.min() >= -1e-6 and inside.max() <= 1 + 1e-6
+    np.testing.assert_allclose(inside.mean(0), 0.5, atol=0.01)
+    np.testing.assert_allclose(np.cov(inside.T), np.eye(4) / 12, atol=0.002)
+    part, _ = random_points(cells[:100], SHAPE, 0.25, 0.5, seed)
+    np.testing.assert_array_equal(part, points[:100])
+    assert (random_points(cells, SHAPE, 0.25, 0.5, np.uint64(6))[1] != times).mean() > 0.99
