@@ -16,7 +16,8 @@ class Adam:
     def __init__(
         self, groups: list[dict[str, Any]], betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-8
     ) -> None:
-        self.param_groups = [{"betas": betas, "eps": eps, "weight_decay": 0, **group} for group in groups]
+        given = {"betas": betas, "eps": eps, "weight_decay": 0, "fused": True}
+        self.param_groups = [given | group for group in groups]
         self._state: dict[torch.Tensor, dict[str, torch.Tensor]] = {}
 
     def zero_grad(self) -> None:
@@ -33,12 +34,12 @@ class Adam:
             states = [self._state_of(parameter) for parameter in parameters]
             adam(
                 parameters,
-                [parameter.grad for parameter in parameters],
+                [parameter.grad.contiguous() for parameter in parameters],  # `fused` reads them as if they were
                 [state["exp_avg"] for state in states],
                 [state["exp_avg_sq"] for state in states],
                 [],
                 [state["step"] for state in states],
-                foreach=False,
+                fused=group["fused"],
                 amsgrad=False,
                 beta1=group["betas"][0],
                 beta2=group["betas"][1],
@@ -62,7 +63,7 @@ class Adam:
             for number, state in found["state"].items()
         }
         self.param_groups = [
-            saved | {"params": group["params"]}
+            group | saved | {"params": group["params"]}
             for saved, group in zip(found["param_groups"], self.param_groups, strict=True)
         ]
 

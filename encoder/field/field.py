@@ -232,7 +232,7 @@ class Field(nn.Module):
         nothing jumps where they end.
         """
         with torch.no_grad():
-            self.theta[self.border] = 0
+            self.theta.index_fill_(0, self.border, 0)
             for s, name, values in self._frozen:
                 self.plane(s, name).copy_(values)
 

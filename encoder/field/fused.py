@@ -1,5 +1,6 @@
 """The CPU kernels as functions of torch fields and rays: what stands in for `kpc.encoder.field.render` on the CPU."""
 
+import functools
 from collections.abc import Callable
 
 import numba
@@ -29,13 +30,20 @@ def plane_set(
     """Return planes (n,) and motion grid as the kernels take them, with the coarsest `scales` only where given."""
     if motion is None:
         motion = np.zeros((0, 1, 1, 1, 3), np.float32)
-    table, held = layout.table[:scales], layout.held[:scales]
-    places = np.zeros((len(table), 2, kernels.PLACES), np.int32)
-    places[:, 0, : len(kernels.AXES)] = np.maximum(table, 0)
-    places[:, 1, : len(kernels.AXES)] = held[:, [column_axis for column_axis, _ in kernels.AXES]] * layout.channels
-    intervals = (held - 1).astype(np.float32)
-    areas = layout.areas[:scales].reshape(len(table), -1)
-    return kernels.PlaneSet(theta, places.reshape(len(table), -1), intervals, layout.channels, areas, motion)
+    places, intervals, areas = (array[:scales] for array in _places(layout))
+    return kernels.PlaneSet(theta, places, intervals, layout.channels, areas, motion)
+
+
+@functools.lru_cache(maxsize=8)
+def _places(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `places`, `intervals` and `areas` of a `PlaneSet`."""
+    scales = len(layout.table)
+    places = np.zeros((scales, 2, kernels.PLACES), np.int32)
+    places[:, 0, : len(kernels.AXES)] = np.maximum(layout.table, 0)
+    columns = [column_axis for column_axis, _ in kernels.AXES]
+    places[:, 1, : len(kernels.AXES)] = layout.held[:, columns] * layout.channels
+    intervals = (layout.held - 1).astype(np.float32)
+    return places.reshape(scales, -1), intervals, layout.areas.reshape(scales, -1)
 
 
 def planes_of(field: Field, scales: int | None = None) -> kernels.PlaneSet:
@@ -243,3 +251,60 @@ def fused_features(field: Field) -> Callable[[Tensor, Tensor], Tensor]:
     return lambda points, times: FusedFeatures.apply(  # type: ignore[no-any-return,no-untyped-call]
         field.theta, field.motion, field.layout, points, times
     )
+
+
+class ColourBasis:
+    """The colour basis of a batch of rays by the kernels, times a mask on the features, and its transpose.
+
+    Attributes:
+        values: (N, 3, F) float32, of each ray; (1, 3, F) of all where colour is view-independent.
+    """
+
+    def __init__(self, field: Field, rays: Rays, mask: np.ndarray, view_dependent: bool) -> None:
+        """`mask`: factors (F,) float32 on the first F features of the field."""
+        self.field, self.mask, self.view_dependent = field, mask, view_dependent
+        F = len(mask)
+        w1, b1, w2, b2 = (p.detach().numpy() for p in (field.w1, field.b1, field.w2, field.b2))
+        if not view_dependent:
+            self.values = np.ascontiguousarray(b2[None, :, :F] * mask)
+            return
+        self.inner = np.ascontiguousarray(np.concatenate([w1, b1[:, None]], axis=1).T)
+        outer = np.concatenate([w2[:, :F], b2[:, :F, None]], axis=2) * mask[:, None]
+        self.outer = np.ascontiguousarray(outer.reshape(3 * F, -1).T)
+        codes, numbers = np.zeros((0, len(b1)), np.float32), np.zeros(0, np.int64)
+        if field.codes is not None and rays.appearances is not None:
+            codes, numbers = field.codes.detach().numpy(), rays.appearances.numpy()
+        self.rays = rays.directions.numpy(), codes, numbers
+        basis, self.hidden = kernels.colour_basis(*self.rays, self.inner, self.outer, parts())
+        self.values = basis.reshape(-1, 3, F)
+
+    def set_gradients(self, g: np.ndarray, g_rays: np.ndarray, wants_rays: bool) -> None:
+        """Set the gradients of the field's parameters on which the basis depends, and add to those of directions.
+
+        Args:
+            g: gradient of `values` (N, 3, F); or, where there is one for all rays, parts (workers, 3, F) of its sum.
+            g_rays: (N, RAY_GRADIENTS) float32, used if `wants_rays`.
+        """
+        field, F = self.field, len(self.mask)
+        if not self.view_dependent:
+            field.b2.grad = self._masked(g.sum(0)[..., None])[..., 0]
+            return
+        directions, codes, numbers = self.rays
+        workers = numba.get_num_threads()
+        g_weights = tuple(np.zeros((workers, *a.shape), np.float32) for a in (self.inner, self.outer, codes))
+        weights, g_basis = (self.inner, self.outer), g.reshape(len(g), -1)
+        kernels.colour_basis_transpose(
+            directions, numbers, self.hidden, *weights, g_basis, g_weights, g_rays, wants_rays
+        )
+        g_inner, g_outer, g_codes = (a.sum(0) for a in g_weights)
+        inner, outer = torch.from_numpy(g_inner), self._masked(g_outer.T.reshape(3, F, -1))
+        field.w1.grad, field.b1.grad = inner[:-1].T, inner[-1]
+        field.w2.grad, field.b2.grad = outer[..., :-1], outer[..., -1]
+        if field.codes is not None and len(g_codes):
+            field.codes.grad = torch.from_numpy(g_codes)
+
+    def _masked(self, g: np.ndarray) -> Tensor:
+        """Return the gradient of weights of all features (3, features, n), given that of masked ones, (3, F, n)."""
+        whole = np.zeros((3, self.field.layout.features, g.shape[2]), np.float32)
+        whole[:, : len(self.mask)] = g * self.mask[:, None]
+        return torch.from_numpy(whole)

@@ -25,7 +25,7 @@ BLOCK_ROWS = 16
 DEALT = 64
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layout:
     """Where each plane lies in `theta`.
 

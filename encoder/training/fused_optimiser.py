@@ -1,6 +1,5 @@
 """One training step on the CPU: fused kernels for the planes and the explicit decoder's gradient."""
 
-from dataclasses import replace
 from typing import Any
 
 import numba
@@ -11,7 +10,7 @@ from kpc.encoder.field import fused, kernels
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import max_samples_per_ray
-from kpc.encoder.field.priors import appearance_priors, motion_priors
+from kpc.encoder.field.priors import appearance_priors
 from kpc.encoder.field.render import Rays
 from kpc.encoder.training.line_steps import line_steps
 from kpc.encoder.training.optimisers import (
@@ -19,6 +18,7 @@ from kpc.encoder.training.optimisers import (
     BETA2,
     EPSILON,
     Stopwatch,
+    add_motion_prior_gradients,
     add_prior_gradients,
     decoder_optimiser,
     feature_mask,
@@ -87,9 +87,7 @@ class FusedOptimiser:
             mask = feature_mask(self.field, config, number, fraction)
             scales = int(mask.view(-1, layout.channels).any(1).sum())  # masked finer scales take no time either
             mask = mask[: scales * layout.channels]
-            if config.refine != "none":
-                batch = replace(batch, directions=batch.directions.detach().requires_grad_())
-            basis = self._masked_basis(batch, mask)
+            basis = fused.ColourBasis(self.field, batch, mask.numpy(), config.view_dependent)
             planes = fused.planes_of(self.field, scales)
             gradients = self._new_gradients(len(targets), len(mask), planes.motion, number)
         with self.timers("kernel"):
@@ -99,7 +97,7 @@ class FusedOptimiser:
                 torch.cat([self.field.density.detach()[: len(mask)] * mask, bias]).numpy(),
                 fused.volume_of(aabb, occupancy, step_length, self.mapping)._replace(extent=np.float32(extent)),
                 fused.ray_batch(batch),
-                basis.detach().numpy(),
+                basis.values,
                 targets.numpy(),
                 np.float32(config.distortion),
                 gradients,
@@ -112,8 +110,6 @@ class FusedOptimiser:
                 add_prior_gradients(self.field, self.theta, self.grad[0], config, variation, config.regularise_every)
         with self.timers("decoder"):
             self._step_decoder(basis, mask, gradients, rate)
-            if batch.directions.grad is not None:
-                self.ray_gradients[:, 3:6] += batch.directions.grad.numpy()
         if self.lines is not None:
             with self.timers("lines"):
                 self.lines.step(rate, self.grad)
@@ -123,13 +119,6 @@ class FusedOptimiser:
                 self.theta, self.grad, self.mean, self.square, learning_rate, BETA1, BETA2, EPSILON, number + 1
             )
         return float(errors.mean(dtype=np.float64)) / 3, float(counts.mean())
-
-    def _masked_basis(self, batch: Rays, mask: torch.Tensor) -> torch.Tensor:
-        """Return the colour basis of each ray, (N, 3, F), or of all, (1, 3, F), times the mask (F,)."""
-        basis = self.field.b2[None]
-        if self.config.view_dependent:
-            basis = self.field.basis(batch.directions, self.field.appearance_codes(batch.appearances))
-        return (basis[..., : len(mask)] * mask).contiguous()
 
     def _new_gradients(self, rays: int, F: int, motion: np.ndarray, number: int) -> kernels.Gradients:
         """Return `Gradients` for a step: the planes' buffers, and zeros."""
@@ -146,12 +135,13 @@ class FusedOptimiser:
             np.float32(0 if wants_rays else self.config.full_weight),
         )
 
-    def _step_decoder(self, basis: torch.Tensor, mask: torch.Tensor, gradients: kernels.Gradients, rate: float) -> None:
+    def _step_decoder(
+        self, basis: fused.ColourBasis, mask: torch.Tensor, gradients: kernels.Gradients, rate: float
+    ) -> None:
         """Step all parameters but the planes, given the gradients of the masked basis and density."""
         field, config = self.field, self.config
         self.decoder.zero_grad()
-        g_basis = gradients.basis if config.view_dependent else gradients.basis.sum(0, keepdims=True)
-        basis.backward(torch.from_numpy(g_basis))
+        basis.set_gradients(gradients.basis, gradients.rays, gradients.wants_rays)
         g_density = torch.from_numpy(gradients.density.sum(0))
         field.density.grad = torch.zeros_like(field.density)
         field.density.grad[: len(mask)] = g_density[:-1] * mask
@@ -159,9 +149,8 @@ class FusedOptimiser:
         if field.codes is not None:
             total(appearance_priors(field, config)).backward()  # type: ignore[no-untyped-call]
         if gradients.wants_motion and field.motion is not None:
-            total(motion_priors(field, config)).backward()  # type: ignore[no-untyped-call]
-            assert field.motion.grad is not None
-            field.motion.grad += torch.from_numpy(gradients.motion.sum(0))
+            field.motion.grad = torch.from_numpy(gradients.motion.sum(0))
+            add_motion_prior_gradients(field.motion, config)
         set_rate(self.decoder, rate)
         self.decoder.step()
 

@@ -11,6 +11,7 @@ Scales of six planes do without: a space-time plane is such a factor on all that
 not move gain nothing either (docs/design/training.md).
 """
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,17 @@ class LineSteps:
         self.field = field
         self.factors = torch.nn.Parameter(torch.zeros(field.layout.lines, field.layout.channels).to(field.theta))
         self.adam = make_adam([([self.factors], config.line_rate * config.learning_rate)])
+
+    @functools.cached_property
+    def _planes_of_blocks(self) -> list[tuple[int, int, int, int, int]]:
+        """For each plane its first line, its rows and columns, its first block and the one after its last."""
+        blocks = self.field.layout.line_blocks
+        lines, starts = np.unique(blocks[:, 5], return_index=True)
+        ends = [*starts[1:].tolist(), len(blocks)]
+        return [
+            (line, int(blocks[first, 4]), int(blocks[first, 3]), first, last)
+            for line, first, last in zip(lines.tolist(), starts.tolist(), ends, strict=True)
+        ]
 
     @torch.no_grad()
     def step(self, rate: float, grad: np.ndarray | None = None) -> None:
@@ -70,9 +82,7 @@ class LineSteps:
         found = np.zeros((layout.lines, M), np.float32)
         parts = np.zeros((len(blocks), int(blocks[:, 3].max()) * M), np.float32)
         kernels.line_gradients(self.field.theta.detach().numpy(), grad, blocks, M, found, parts)
-        lines, starts = np.unique(blocks[:, 5], return_index=True)
-        for line, first, last in zip(lines, starts, [*starts[1:], len(blocks)], strict=True):
-            columns, rows = blocks[first, 3:5]
+        for line, rows, columns, first, last in self._planes_of_blocks:
             found[line + rows : line + rows + columns] = parts[first:last, : columns * M].sum(0).reshape(columns, M)
         return torch.from_numpy(found)
 

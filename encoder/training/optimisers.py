@@ -41,8 +41,10 @@ def feature_mask(field: Field, config: TrainConfig, step: int, fraction: float) 
     remaining scales are not, as coarse scales are to make a picture by themselves.
     """
     M, scales = field.layout.channels, len(field.layout.resolution)
-    rng = np.random.default_rng((config.seed, step))
     dropped = min(round(config.channel_dropout * M), M - 1) if fraction < config.dropout_until else 0
+    if not dropped and not config.scale_dropout and fraction >= config.coarse_until:
+        return torch.ones(scales * M)
+    rng = np.random.default_rng((config.seed, step))
     factors = np.full((scales, M), M / (M - dropped), np.float32)
     factors[:, rng.permutation(M)[:dropped]] = 0
     if scales > 1 and rng.random() < config.scale_dropout:
@@ -67,6 +69,19 @@ def add_prior_gradients(
         factor * config.sparse_transients,
         variation.steep,
     )
+
+
+def add_motion_prior_gradients(motion: torch.nn.Parameter, config: TrainConfig) -> None:
+    """Add the gradient of `kpc.encoder.field.priors.motion_priors` to that of the motion grid (T, Nz, Ny, Nx, 3)."""
+    grid = motion.detach()
+    assert motion.grad is not None
+    for axis, weight in enumerate([config.motion_smoothness_time] + 3 * [config.motion_smoothness_space]):
+        inner = grid.shape[axis] - 2
+        if inner < 1:
+            continue
+        slope = grid.diff(n=2, dim=axis).mul_(2 * weight / grid.numel())
+        for first, factor in enumerate((1, -2, 1)):
+            motion.grad.narrow(axis, first, inner).add_(slope, alpha=factor)
 
 
 def total(weighted: dict[str, torch.Tensor]) -> torch.Tensor:

@@ -44,6 +44,8 @@ class RaySampler:
         self.dataset, self.mapping, self.appearances, self.cameras = dataset, mapping, appearances, cameras
         self.train = np.flatnonzero(~dataset.pictures.is_test) if train is None else train
         self.ends = np.cumsum(dataset.usable_counts[self.train])
+        times, ranks = np.unique(dataset.pictures.time, return_inverse=True)
+        self._ranks = ranks.astype(np.min_scalar_type(len(times)))  # numbers of 16 bits are sorted ten times as fast
         self.frames: np.ndarray | None = None
         if dataset.has_alpha and dataset.masks is None:
             self.frames = np.array([self._frame(dataset.pixels.picture(int(p))[..., 3]) for p in self.train], np.int64)
@@ -86,7 +88,7 @@ class RaySampler:
             picture = np.concatenate([self.train[which], picture])
             row, column = np.concatenate([top + below, row]), np.concatenate([left + beside, column])
         # Rays of one time read the same rows of the space-time planes, which then stay in the cache.
-        order = np.argsort(pictures.time[picture], kind="stable")
+        order = np.argsort(self._ranks[picture], kind="stable")
         return DrawnPixels(picture[order], row[order], column[order])
 
     def rays(

@@ -6,6 +6,7 @@ becomes 1e-4 at worst. Colours must agree to 1e-4, a fortieth of an 8-bit level;
 element of their array.
 """
 
+import copy
 import math
 import os
 import subprocess
@@ -24,6 +25,7 @@ from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import (
+    ColourBasis,
     colour_gradients,
     count_samples,
     fused_features,
@@ -50,7 +52,7 @@ from scenes import tiny_scene, with_motion
 COLOUR = 1e-4
 GRADIENT = 1e-3
 
-KERNEL_MODULES = ("geometry", "planes", "marching", "backward", "points", "updates")
+KERNEL_MODULES = ("geometry", "planes", "marching", "backward", "points", "directions", "updates")
 
 
 def assert_peaks_match(ours: np.ndarray, theirs: np.ndarray) -> None:
@@ -288,6 +290,42 @@ def test_features_and_their_gradients_for_any_number_of_channels(channels: int, 
         found.append((out.detach(), gradient))
     for ours, theirs in zip(*found, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-5 * float(theirs.abs().max()))
+
+
+@pytest.mark.parametrize("coded", ["scene", "rays", "both"])
+@pytest.mark.parametrize("view_dependent", [False, True])
+def test_colour_bases_and_their_gradients_equal_those_of_pytorch(coded: str, view_dependent: bool) -> None:
+    """With a mask on the features of the first of two scales, and as many channels as fill no vector.
+
+    Without numbers of appearances, or without codes, rays have no code.
+    """
+    rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    layout = Layout.of(np.array([[3, 3, 3, 0], [5, 5, 5, 0]]), 13)
+    field = Field(layout, 5, generator, appearances=0 if coded == "rays" else 3)
+    with torch.no_grad():
+        for parameter in [field.w2, *([field.codes] if field.codes is not None else [])]:
+            parameter += torch.from_numpy(rng.normal(0, 1, parameter.shape).astype(np.float32))
+    numbers = None if coded == "scene" else torch.from_numpy(rng.integers(0, 3, 40))
+    rays = replace(random_rays(tiny_scene(), 40), appearances=numbers)
+    mask = torch.from_numpy(rng.integers(0, 3, 13).astype(np.float32))
+    basis = ColourBasis(field, rays, mask.numpy(), view_dependent)
+    g = rng.normal(0, 1, basis.values.shape).astype(np.float32)
+    g_rays = np.ones((40, kernels.RAY_GRADIENTS), np.float32)
+    basis.set_gradients(g, g_rays, wants_rays=True)
+
+    twin, directions = copy.deepcopy(field).double(), rays.directions.double().requires_grad_()
+    twin.zero_grad()
+    theirs = twin.basis(directions, twin.appearance_codes(rays.appearances)) if view_dependent else twin.b2[None]
+    theirs = theirs[..., :13] * mask
+    theirs.backward(torch.from_numpy(g).double())
+    np.testing.assert_allclose(basis.values, theirs.detach().numpy(), atol=1e-5)
+    assert field.codes is None or (field.codes.grad is not None) == (view_dependent and coded == "both")
+    for name in ("b2", "w2", "w1", "b1", "codes") if view_dependent else ("b2",):
+        if (expected := getattr(twin, name)) is not None and expected.grad is not None:
+            np.testing.assert_allclose(getattr(field, name).grad.numpy(), expected.grad.numpy(), atol=1e-4)
+    if view_dependent and directions.grad is not None:
+        np.testing.assert_allclose(g_rays[:, 3:6] - 1, directions.grad.numpy(), atol=1e-4)
+    assert (g_rays[:, [0, 1, 2, 6, 7, 8, 9]] == 1).all()
 
 
 def test_log_densities_are_clipped() -> None:

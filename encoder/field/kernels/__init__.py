@@ -22,6 +22,7 @@ Modules
     marching     one ray through the field; rendering; lists of samples
     backward     the gradient of a batch's loss
     points       features and densities at given points
+    directions   the colour basis of rays
     updates      Adam, factors of rows and columns, and the gradients of the priors
 
 Numba's on-disk cache notices a change in the file of the function that was called, not in the files of functions that
@@ -30,6 +31,7 @@ it calls: after editing a module here, delete `__pycache__`.
 
 from kpc.encoder.field.kernels.arguments import RAY_GRADIENTS, Gradients, PlaneSet, RayBatch, SampleArrays, Volume
 from kpc.encoder.field.kernels.backward import backpropagate
+from kpc.encoder.field.kernels.directions import colour_basis, colour_basis_transpose
 from kpc.encoder.field.kernels.marching import collect_samples, render, weigh_samples
 from kpc.encoder.field.kernels.points import features, log_densities, scatter_features
 from kpc.encoder.field.kernels.texels import AXES, PLACES
@@ -48,6 +50,8 @@ __all__ = [
     "add_priors",
     "backpropagate",
     "collect_samples",
+    "colour_basis",
+    "colour_basis_transpose",
     "features",
     "line_gradients",
     "log_densities",

@@ -170,3 +170,25 @@ def dot(_: Any, a: Any, at: Any, b: Any, b_at: Any, count: Any) -> Any:
 
     whole = types.int64
     return types.float32(a, whole, b, whole, whole), generate
+
+
+@intrinsic
+def add_scaled(_: Any, out: Any, at: Any, factor: Any, values: Any, values_at: Any, count: Any) -> Any:
+    """Add factor * values[values_at + i] to out[at + i] for i < count."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        _, at, factor, _, values_at, count = arguments
+        out, values = (array_of(context, builder, signature, arguments, n).data for n in (0, 3))
+
+        def emit(i: Any, wide: int) -> None:
+            place = builder.add(at, i)
+            term = product(
+                builder, spread(builder, factor, wide), load(builder, values, builder.add(values_at, i), wide)
+            )
+            store(builder, added(builder, load(builder, out, place, wide), term), out, place)
+
+        for_each_vector(builder, count, WIDTHS, emit)
+        return context.get_dummy_value()
+
+    whole = types.int64
+    return types.void(out, whole, types.float32, values, whole, whole), generate
