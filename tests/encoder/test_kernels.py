@@ -326,6 +326,9 @@ def test_colour_bases_and_their_gradients_equal_those_of_pytorch(coded: str, vie
     if view_dependent and directions.grad is not None:
         np.testing.assert_allclose(g_rays[:, 3:6] - 1, directions.grad.numpy(), atol=1e-4)
     assert (g_rays[:, [0, 1, 2, 6, 7, 8, 9]] == 1).all()
+    with torch.no_grad():
+        field.b1[2] = math.nan
+    assert np.isnan(ColourBasis(field, rays, np.ones(13, np.float32), view_dependent).values).all() == view_dependent
 
 
 def test_log_densities_are_clipped() -> None:

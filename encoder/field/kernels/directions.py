@@ -39,10 +39,10 @@ def colour_basis(directions, codes, numbers, inner, outer, workers):
             for j in range(width):
                 basis[i, j] = outer[H, j]
             for h in range(H):
-                value = max(hidden[i, h], np.float32(0.0))
-                hidden[i, h] = value
-                if value > 0:
-                    add_scaled(basis, i * width, value, outer, h * width, width)
+                if hidden[i, h] <= 0:  # what is no number stays, so that the error of training names it
+                    hidden[i, h] = np.float32(0.0)
+                else:
+                    add_scaled(basis, i * width, hidden[i, h], outer, h * width, width)
     return basis, hidden
 
 
@@ -64,7 +64,7 @@ def colour_basis_transpose(directions, numbers, hidden, inner, outer, g_basis, g
             add_scaled(g_outer[worker], H * width, np.float32(1.0), g_basis, i * width, width)
             for h in range(H):
                 g_hidden[0, h] = np.float32(0.0)
-                if hidden[i, h] > 0:
+                if hidden[i, h] != 0:
                     add_scaled(g_outer[worker], h * width, hidden[i, h], g_basis, i * width, width)
                     g_hidden[0, h] = dot(g_basis, i * width, outer, h * width, width)
             for term in range(TERMS):
