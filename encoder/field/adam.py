@@ -16,7 +16,7 @@ class Adam:
     def __init__(
         self, groups: list[dict[str, Any]], betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-8
     ) -> None:
-        given = {"betas": betas, "eps": eps, "weight_decay": 0, "fused": True}
+        given: dict[str, Any] = {"betas": betas, "eps": eps, "weight_decay": 0, "fused": True}
         self.param_groups = [given | group for group in groups]
         self._state: dict[torch.Tensor, dict[str, torch.Tensor]] = {}
 
