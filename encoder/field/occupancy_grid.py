@@ -16,9 +16,6 @@ MERGE_TOLERANCE = 0.1
 # What `OccupancyGrid.marched` holds of cells in which rays take every STRIDE-th sample only, for as many steps.
 STRIDED, STRIDE = 2, 4
 
-# A cell is 1 if it is occupied, and STRIDED more if it is kept; none is this.
-NO_CODE = 255
-
 # A function of (N, 3) float32 points in [0, 1]^3 and (N,) float32 times that returns (N,) log densities.
 DensityAt = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -131,7 +128,8 @@ class OccupancyGrid:
 
     def _activate_all(self) -> None:
         """Set `occupied` and `marched` of all cells."""
-        self._codes = np.full(self.visible.size, NO_CODE, np.uint8)
+        # Of each cell what `marched` was set by: 1 if it was occupied, and STRIDED more if it was kept.
+        self._codes = np.zeros(self.visible.size, np.uint8)
         self.marched = np.zeros(self._dense.shape, np.uint8)
         self._activate()
 
