@@ -20,7 +20,8 @@ def appearance_in(
 ) -> Chosen:
     """Return what --appearance chooses in each scene that is shown at these times; the average without the option.
 
-    Groups without any appearance are rendered with their average among others that have some; `say` is told so once.
+    Groups without any appearance are rendered with their average among others that have some; `say` is called with
+    that, once.
 
     Raises:
         UsageError: the appearance is not in all groups that have any, or a share lies outside [0, 1].

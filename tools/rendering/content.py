@@ -39,7 +39,7 @@ def renderer_of(
     """Return a function that renders a picture over the background of the options, and the name of the renderer.
 
     With a transparent background colours are multiplied by opacity. The appearance of the options is looked for in all
-    that is shown at these times before anything is rendered; `say` is told what users should know of it.
+    that is shown at these times before anything is rendered; `say` is called with what users should know of it.
     """
     if options.backend == "reference" and options.quality != "reference":
         raise UsageError(f"--quality {options.quality}: is of the gl backend; leave it out, or --backend reference")

@@ -71,12 +71,7 @@ def _begin(folder: Path, options: argparse.Namespace, now: dict[str, Any], paths
             before = {}
         changed = [name for name in now if _identity(before.get(name)) != _identity(now[name])]
         if changed and options.resume:
-            name = changed[0]
-            what, was, given = NAMES.get(name, "--" + name.replace("_", "-")), before.get(name), now[name]
-            kinds, asked = ({Path(one).suffix[1:] for one in some} for some in (_pictures(folder), names))
-            by_format = (None, "transparent"), ("transparent", None)  # where --background is not given
-            if name == "background" and (was, given) in by_format and "exr" in kinds ^ asked:
-                what, was, given = "--format", " and ".join(sorted(kinds)), " and ".join(asked)
+            what, was, given = _difference(changed[0], before, now, _pictures(folder), names)
             raise UsageError(
                 f"--resume: the pictures in {folder} were rendered with another value of {what} "
                 f"({_shown(was)}, now {_shown(given)}); give the same, or another folder with -o"
@@ -106,6 +101,24 @@ def _begin(folder: Path, options: argparse.Namespace, now: dict[str, Any], paths
         notice(f"kprender: {folder}: other pictures stay there, such as {min(others)}; {len(others):,} in all")
     with atomic_write(record) as temporary:
         temporary.write_text(json.dumps(now, indent=1) + "\n")
+
+
+def _difference(
+    name: str, before: dict[str, Any], now: dict[str, Any], lying: Collection[str], names: Collection[str]
+) -> tuple[str, Any, Any]:
+    """Return what differs, as users name it, and its value in the folder and now.
+
+    Pictures are transparent in EXR, and not in other formats, where --background is not given: then the format differs.
+
+    Args:
+        name: of a member of the record that differs. lying: pictures in the folder. names: of those to render.
+    """
+    was, given = before.get(name), now[name]
+    kinds, asked = ({Path(one).suffix[1:] for one in some} for some in (lying, names))
+    is_unasked = name == "background" and (was, given) in ((None, "transparent"), ("transparent", None))
+    if kinds and is_unasked and "exr" in kinds ^ asked:
+        return "--format", " and ".join(sorted(kinds)), " and ".join(asked)
+    return NAMES.get(name, "--" + name.replace("_", "-")), was, given
 
 
 def _pictures(folder: Path) -> set[str]:
