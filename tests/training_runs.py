@@ -29,6 +29,7 @@ TINY = TrainConfig(
     samples_across=32,
     cells_across=12,
     steps=24,
+    object_steps=72,
     rays=256,
     samples=8192,
     warmup=5,

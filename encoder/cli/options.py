@@ -15,7 +15,6 @@ from kpc.encoder.evaluation.testing_time import FEWEST_PICTURES
 from kpc.encoder.field.appearances import choose_appearance
 from kpc.encoder.field.config import (
     APPEARANCES,
-    OBJECT_LENGTH,
     PRESETS,
     PROGRESSIVE_SCALE_DROPOUT,
     REFINEMENTS,
@@ -228,11 +227,13 @@ def _add_training_options(parser: argparse.ArgumentParser) -> None:
         "in which it moves; one: all scales hold both (default: %(default)s)",
     )
     steps = ", ".join(f"{name} {config.steps:,}" for name, config in sorted(PRESETS.items()))
+    adapted = sorted((name, config.object_steps) for name, config in PRESETS.items() if config.adapts_to_object)
+    object_steps = ", ".join(f"{name} {count:,}" for name, count in adapted)
     parser.add_argument(
         "--steps",
         type=_positive,
-        help=f"optimiser steps (default, by preset: {steps}; "
-        f"{OBJECT_LENGTH} times as many, but for paper, for an object on its own that one moving camera filmed)",
+        help=f"optimiser steps (default, by preset: {steps}; for an object on its own that one moving camera filmed: "
+        f"{object_steps})",
     )
     parser.add_argument(
         "--time-budget", type=cli.duration_s, metavar="10m", help="train for so long instead of a number of steps"

@@ -88,6 +88,8 @@ class TrainConfig:
 
     # Optimiser steps where no time budget is given.
     steps: int = 6000
+    # The same for an object on its own that one moving camera filmed (`for_single_object`).
+    object_steps: int = 18000
     # The most rays per step (K-Planes: 4,096); fewer while rays have many samples.
     rays: int = 4096
     # The most samples per step, on average. It bounds the time of a step before the occupancy grid has formed.
@@ -213,6 +215,7 @@ class TrainConfig:
         positive = (
             "channels",
             "steps",
+            "object_steps",
             "rays",
             "samples",
             "hidden",
@@ -304,12 +307,9 @@ class TrainConfig:
             view_dependent=False,
             robust_tv_from=1.0,
             samples_across=max(32, self.samples_across // 2),
-            steps=OBJECT_LENGTH * self.steps,
+            steps=self.object_steps,
         )
 
-
-# `steps` of an object on its own that one moving camera filmed, as a multiple of the preset's.
-OBJECT_LENGTH = 3
 
 # `scale_dropout` of scenes that are to be shown while they are being received.
 PROGRESSIVE_SCALE_DROPOUT = 0.1
@@ -321,6 +321,7 @@ PRESETS = {
         samples_across=160,
         cells_across=64,
         steps=1500,
+        object_steps=4500,
         occupancy_start=64,
         tune_steps=0,
         thorough_from=6000,
@@ -332,16 +333,25 @@ PRESETS = {
         layered_channels=16,
         samples_across=224,
         cells_across=80,
-        steps=3000,
+        steps=4000,
+        object_steps=9000,
     ),
     # Two scales of 16 channels rather than three of 8 (measured).
-    "balanced": TrainConfig(resolutions=(96, 256), channels=16, steps=10000, temporal_start=0.75, temporal_floor=0.3),
+    "balanced": TrainConfig(
+        resolutions=(96, 256),
+        channels=16,
+        steps=10000,
+        object_steps=30000,
+        temporal_start=0.75,
+        temporal_floor=0.3,
+    ),
     "best": TrainConfig(
         resolutions=(64, 128, 256, 448),
         channels=16,
         samples_across=512,
         cells_across=128,
         steps=40000,
+        object_steps=120000,
         robust_space_variation=5e-3,
     ),
     # K-Planes' own settings (section 3.1 and appendix), except that rays are marched through an occupancy grid.
