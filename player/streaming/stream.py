@@ -47,7 +47,7 @@ LEAST_BUDGET = 1 << 25
 RATE_OVER_S = 5.0
 
 
-@dataclass
+@dataclass(eq=False)
 class Piece:
     """A decoded segment.
 
@@ -146,7 +146,7 @@ class Stream:
                 self._interrupt_for(head.time)
 
     def upload(self, renderer: Renderer, max_bytes: float = UPLOAD_BYTES) -> bool:
-        """Take over finished segments.
+        """Take over finished segments. The space planes of a finer scale are complete once it can be shown at once.
 
         Args:
             renderer: the renderer of the scene.
@@ -161,8 +161,7 @@ class Stream:
         if self._bug is not None:
             raise self._bug
         changed = refresh = False
-        while max_bytes > 0 and self._finished:
-            piece = self._finished[0]
+        while max_bytes > 0 and (piece := self._next_finished()) is not None:
             if self.parts.moves[piece.position]:
                 self.parts.put(piece.number, piece.data)
                 refresh = is_done = True
@@ -177,7 +176,7 @@ class Stream:
             changed = True
             if is_done:
                 with self._change:
-                    self._finished.popleft()
+                    self._finished.remove(piece)
                     self._loaded[piece.position] = True
                     self._drop(self._loaded & ~self._keep)
                     self._change.notify_all()
@@ -190,16 +189,14 @@ class Stream:
         """Return whether the picture at `time` can be drawn; after a wait, only once the next RESUME_S are there.
 
         It needs the segments at `time` of all scales whose space planes have arrived, and of scale 0 at least: a
-            picture does
-        not become coarser again.
+        picture does not become coarser again.
 
         Args:
             time: of the clip, [0, 1].
             rate: fraction of the clip that is played per second.
         """
         end = min(time + rate * RESUME_S, 1.0) if self._stalled else time
-        needed = self.parts.is_needed(time, end) & (self.parts.scales < max(self.complete_scales, 1)) & self._keep
-        self._stalled = bool((needed & ~self._loaded).any())
+        self._stalled = self._is_lacking(self.parts.scales < max(self.complete_scales, 1), time, end)
         return not self._stalled
 
     @property
@@ -297,6 +294,29 @@ class Stream:
         if isinstance(self.source, RemoteSource):
             self.source.close()
         self._thread.join(timeout=0.5)  # if the server does not answer, the thread ends later
+
+    def _next_finished(self) -> Piece | None:
+        """Return the segment to take over next: the first one that is not to wait."""
+        return next((piece for piece in tuple(self._finished) if not self._is_early(piece)), None)
+
+    def _is_early(self, piece: Piece) -> bool:
+        """Whether a segment would complete the space planes of a finer scale, whose time planes are not there yet.
+
+        Playback would stop for them, while coarser scales can be shown.
+        """
+        scale = self.parts.scales[piece.position]
+        if scale == 0 or self.parts.moves[piece.position]:
+            return False
+        is_of_scale = self.parts.scales == scale
+        others = is_of_scale & ~self.parts.moves & ~self._loaded
+        others[piece.position] = False
+        head = self._head
+        end = min(head.time + head.rate * RESUME_S, 1.0)
+        return not others.any() and self._is_lacking(is_of_scale & self.parts.moves, head.time, end)
+
+    def _is_lacking(self, which: np.ndarray, time: float, end: float) -> bool:
+        """Whether segments among some, (N,) bool, that are needed from a time to another one have not arrived."""
+        return bool((which & self.parts.is_needed(time, end) & self._keep & ~self._loaded).any())
 
     def _interrupt_for(self, time: float) -> None:
         """With the lock held: interrupt a request if segments that the picture needs now would have to wait for it."""

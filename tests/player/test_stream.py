@@ -128,6 +128,25 @@ def test_a_coarse_picture_arrives_early_and_is_refined(watched: Callable[..., St
     assert found[0][1] < 0.4 * len(data) and quality[0] < quality[-1] == psnr(wanted, wanted)
 
 
+def test_a_finer_scale_is_shown_once_its_time_planes_are_there(watched: Callable[..., Stream], tmp_path: Path) -> None:
+    """Playback never stops for a scale that is finer than what could be shown before."""
+    (tmp_path / "scene.kpc").write_bytes(coded(tiny_scene(4, time=40, scales=3, resolution=(48, 40, 32)), 4))
+    with serving(tmp_path, link=Link(rate=30_000)) as url:
+        stream = watched(f"{url}/scene.kpc")
+        renderer = Renderer(gl.context(), stream.scene)
+        until(lambda: stream.can_show(0.0), stream, renderer)
+        began, scales = clock.monotonic(), []
+        while not stream.is_settled and clock.monotonic() < began + TIMEOUT_S:
+            time = (clock.monotonic() - began) / 20 % 1.0
+            stream.set_playhead(Playhead(time, 1 / 20))
+            stream.upload(renderer)
+            if stream.complete_scales not in scales:
+                assert stream.can_show(time, 1 / 20)
+                scales.append(stream.complete_scales)
+            clock.sleep(0.001)
+    assert scales == [1, 2, 3]
+
+
 def long_scene() -> bytes:
     return coded(tiny_scene(4, time=120), 4)
 
