@@ -49,6 +49,22 @@ def test_what_passes_is_removed_and_masked() -> None:
             assert (share[expected] == 1).all() and (share[~expected] == 0).all()
 
 
+def test_what_is_nearer_is_masked_whatever_its_colour() -> None:
+    """A thing of the wall's colour passes before it; what is farther or hardly nearer is no part of it."""
+    patches = {1: 2.0, 9: 3.9, 17: 3.7, 25: 5.0}
+    camouflaged = wall_with(*((slice(8, 14), slice(k, k + 6), WALL, depth) for k, depth in patches.items()))
+    share = matte(camouflaged, wall_with())
+    assert (share[8:14, 1:7] == 1).all() and (share[8:14, 9:15] == 0).all()
+    np.testing.assert_allclose(share[8:14, 17:23], 0.5, atol=1e-5)
+    share[8:14, [*range(1, 7), *range(17, 23)]] = 0
+    assert not share.any()
+    nothing = replace(wall_with(), depth=np.full((HEIGHT, WIDTH), np.inf, np.float32))
+    assert not matte(nothing, wall_with()).any() and not matte(nothing, nothing).any()
+    assert (matte(wall_with(), nothing) == 1).all()  # a thing of the background's colour, before nothing
+    haze = replace(wall_with(), opacity=np.full((HEIGHT, WIDTH), 0.002, np.float32))
+    assert matte(haze, nothing).max() < 0.01
+
+
 def test_what_never_leaves_stays() -> None:
     pictures = [wall_with(ball(4), noise=0.1 + k) for k in range(16)]
     plate = clean_plate(pictures)

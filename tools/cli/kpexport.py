@@ -122,7 +122,7 @@ def _shots(scene: Scene, loaded: Scene | GroupedScene, options: argparse.Namespa
     """Return the frames to export, as kprender chooses them."""
     wanted = {"time", "fps", "start_s", "end_s", "frames", "step"}
     times = {name: value for name, value in vars(options).items() if name in wanted}
-    fixed = {"path": None, "cameras": None, "orbit": None, "camera": None, "size": None, "shutter": 0.0}
+    fixed = dict.fromkeys(("path", "cameras", "orbit", "camera", "every_camera", "size")) | {"shutter": 0.0}
     return shots_of(scene, loaded.clip, argparse.Namespace(**times, **fixed), is_film=False)
 
 

@@ -9,6 +9,8 @@
     kprender scene.kpc --background transparent -o cut.webm   with alpha
     kprender scene.kpc --static-only --time 0 -o plate.png    without what moves
     kprender scene.kpc --dynamic-only --background transparent -o moves.mov
+    kprender scene.kpc --with actor.kpc -o both.mp4           another scene in this one
+    kprender scene.kpc --every-camera -o DIR                  what every camera sees, for kpenc to train on
     kprender scene.kpc --appearance dawn.jpg:dusk.jpg:0.3 -o clip.mp4
 
 The player saves files for --cameras and --path.
@@ -20,7 +22,7 @@ import functools
 import sys
 import tempfile
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +33,15 @@ from kpc.format.common.errors import UsageError
 from kpc.format.common.films import FilmFormat, write_film
 from kpc.format.common.progress import progress
 from kpc.format.common.text import NAMES_SHOWN, counted, escaped, notice
+from kpc.format.container.groups import GroupedScene
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Part, Rendering
-from kpc.tools.rendering import pictures, resuming
+from kpc.tools.rendering import pictures, resuming, transforms
+from kpc.tools.rendering.composition import played_clip
 from kpc.tools.rendering.content import mean_picture, renderer_of
 from kpc.tools.rendering.options import MAX_SIDE, parser
 from kpc.tools.rendering.outputs import Output
-from kpc.tools.rendering.shots import Shots, rate_note, shots_of
+from kpc.tools.rendering.shots import Shots, check_distance, rate_note, shots_of
 from kpc.tools.rendering.sound import write_sound
 
 # Contents that change colours and not depth, and their options.
@@ -57,14 +61,17 @@ def _command(argv: list[str]) -> None:
     is_transparent = _resolve_background(output, options)
     loaded = kpc.load(options.scene)
     scene, _ = loaded.at(0.0)  # the first group of a long clip has the cameras and bounds of all
-    shots = shots_of(scene, loaded.clip, options, output.is_film)
-    _check(shots, output, options)
-    if (note := rate_note(loaded.clip, options)) is not None:
+    others = _other_scenes(options)
+    scenes = [scene, *(other.at(0.0)[0] for other in others)]
+    clip = played_clip(loaded.clip, [other.clip for other in others])
+    shots = shots_of(scene, clip, options, output.is_film)
+    _check(shots, output, options, scenes)
+    if (note := rate_note(clip, options)) is not None:
         _say(note)
     has_times = options.time is not None or any(shots.time(number) for number in shots.numbers)
-    if options.cameras and loaded.clip.frame_count > 1 and not has_times:
+    if options.cameras and clip.frame_count > 1 and not has_times:
         _say(f"{options.cameras}: all views are at the beginning of the clip; --time chooses another time")
-    render, renderer = renderer_of(loaded, options, shots.times(), _say)
+    render, renderer = renderer_of(loaded, options, shots.times(), _say, others)
     _say(renderer)
 
     def picture(number: int) -> Rendering:
@@ -78,9 +85,9 @@ def _command(argv: list[str]) -> None:
             sound = Path(folder) / "sound.wav"
             if reason := write_sound(sound, loaded, shots):
                 _say(reason)
-            what = _write_film(output, film, shots, picture, scene, options, sound if sound.exists() else None)
+            what = _write_film(output, film, shots, picture, scenes, options, sound if sound.exists() else None)
     else:
-        what = _write_pictures(output, shots, picture, scene, options, is_transparent)
+        what = _write_pictures(output, shots, picture, scenes, options, is_transparent)
     print(escaped(f"{what}, in {clock.monotonic() - started:.1f} s"))
 
 
@@ -125,8 +132,11 @@ def _resolve_background(output: Output, options: argparse.Namespace) -> bool:
     return True
 
 
-def _check(shots: Shots, output: Output, options: argparse.Namespace) -> None:
-    """Refuse several pictures for one file, pictures too large to render, and films of two things at once."""
+def _check(shots: Shots, output: Output, options: argparse.Namespace, scenes: Sequence[Scene]) -> None:
+    """Refuse several pictures for one file, pictures too large or scenes too far away to render, and films of two
+    things at once."""
+    if options.every_camera and not output.is_folder:
+        raise UsageError(f"--every-camera: {output.path} is no folder; give a name without suffix or with / at its end")
     if options.depth and output.is_film and options.content in CUT_BY_THE_MATTE:
         raise UsageError(f"--depth: a film shows depth or {CUT_BY_THE_MATTE[options.content]}; leave one of them out")
     if options.depth and output.suffix == ".exr":
@@ -135,7 +145,10 @@ def _check(shots: Shots, output: Output, options: argparse.Namespace) -> None:
         raise UsageError(
             f"-o {output.path}: {len(shots)} pictures do not go into one file; give a folder, a film or --time"
         )
-    for number in shots.numbers if options.cameras else shots.numbers[:1]:
+    for name, other in zip(options.others, scenes[1:], strict=True):
+        for number in shots.numbers:
+            check_distance(other, shots.camera(number), f"--with {name}: ")
+    for number in shots.numbers if options.cameras or options.every_camera else shots.numbers[:1]:
         camera = shots.camera(number)
         if max(camera.width, camera.height) * options.samples > MAX_SIDE:
             raise UsageError(
@@ -144,12 +157,19 @@ def _check(shots: Shots, output: Output, options: argparse.Namespace) -> None:
             )
 
 
+def _other_scenes(options: argparse.Namespace) -> list[Scene | GroupedScene]:
+    """Return the scenes of --with; refuse them where what is shown is no scene."""
+    if options.others and (options.content in ("map", "matte") or options.part is not Part.FULL):
+        raise UsageError("--with: --matte, --dynamic-map and --diagnose show one scene; leave one of them out")
+    return [kpc.load(name) for name in options.others]
+
+
 def _write_film(
     output: Output,
     film: FilmFormat,
     shots: Shots,
     picture: Callable[[int], Rendering],
-    scene: Scene,
+    scenes: Sequence[Scene],
     options: argparse.Namespace,
     sound: Path | None,
 ) -> str:
@@ -160,7 +180,7 @@ def _write_film(
         _say(f"{output.path.name}: its codec needs even sides: the last row or column is repeated")
     if options.depth:
         cameras = [shots.camera(number) for number in shots.numbers]
-        pixels = pictures.depth_pixels(scene, cameras, film.bits)
+        pixels = pictures.depth_pixels(scenes, cameras, film.bits)
     else:
         pixels = functools.partial(pictures.colour_pixels, is_transparent=film.has_alpha, bits=film.bits)
     frames = (pixels(picture(number)) for number in progress(shots.numbers, output.path.name, unit="frames"))
@@ -175,14 +195,14 @@ def _write_pictures(
     output: Output,
     shots: Shots,
     picture: Callable[[int], Rendering],
-    scene: Scene,
+    scenes: Sequence[Scene],
     options: argparse.Namespace,
     is_transparent: bool,
 ) -> str:
     """Render and write pictures; return what was written."""
     unit = None
     if options.depth:
-        unit = pictures.depth_unit(scene, [shots.camera(number) for number in shots.numbers])
+        unit = pictures.depth_unit(scenes, [shots.camera(number) for number in shots.numbers])
     names = [shots.name(number) for number in shots.numbers]
     paths, renamed = output.picture_paths(names, options.depth)
     if renamed:
@@ -190,12 +210,16 @@ def _write_pictures(
         what = f"{one} taken or no plain file name" if len(renamed) == 1 else f"{more} taken or no plain file names"
         now = ", ".join(f"{name!r} becomes {new}" for name, new in renamed[:NAMES_SHOWN])
         now += ", ..." if len(renamed) > NAMES_SHOWN else ""
-        _say(f"{options.cameras}: {counted(len(renamed), 'picture')} {what}: {now}")
+        _say(f"{options.cameras or '--every-camera'}: {counted(len(renamed), 'picture')} {what}: {now}")
     wanted = list(zip(shots.numbers, paths, strict=True))
     with contextlib.ExitStack() as alone:
         if output.is_folder:
             cli.make_folder(output.path)
+            if options.every_camera:
+                transforms.check_folder(output.path)
             alone.enter_context(resuming.rendering(output.path, options, is_transparent, paths))
+            if options.every_camera:
+                transforms.begin(output.path)
         if options.resume:
             wanted = [
                 (number, path)
@@ -204,6 +228,8 @@ def _write_pictures(
             ]
         for number, path in progress(wanted, "render", unit="pictures"):
             pictures.write_picture(path, picture(number), is_transparent, unit)
+        if options.every_camera:
+            transforms.write_transforms(output.path, shots, paths)
     there = f" ({len(shots) - len(wanted)} were there)" if len(wanted) < len(shots) else ""
     camera = shots.camera(shots.numbers[0])
     return f"{output.path}: {counted(len(shots), 'picture')}{there}, {camera.width}x{camera.height}"

@@ -8,7 +8,8 @@ a support of LEAST_SUPPORT, since what hides it must have moved. The plate is th
 the chosen one. So shadows that stay for less than half the time are removed with what casts them, and what never moves
 away stays.
 
-The matte grows from 0 to 1 where a picture differs from the plate by MATTE_RANGE.
+The matte grows from 0 to 1 where a picture differs from the plate by MATTE_RANGE, or is nearer by NEARER_RANGE: a thing
+that has the colour of what it hides is part of it, too.
 """
 
 from collections.abc import Callable
@@ -29,6 +30,8 @@ AGREEMENT = 0.06
 LEAST_SUPPORT, FARTHER = 0.2, 1.1
 # Differences of display values at which the matte is 0 and 1.
 MATTE_RANGE = 0.08, 0.2
+# Shares of the plate's distance by which a picture is nearer where the matte is 0 and 1.
+NEARER_RANGE = 0.05, 0.1
 # Neighbourhood over which support is averaged: a pixel more on each side for so many columns of the picture.
 COLUMNS_PER_NEIGHBOUR = 80
 # Distance that counts for no surface, world units.
@@ -107,8 +110,15 @@ def clean_plate(pictures: list[Rendering]) -> Rendering:
 
 def matte(picture: Rendering, plate: Rendering) -> np.ndarray:
     """Return how much of each pixel moves, (H, W) float32 in [0, 1]."""
-    low, high = MATTE_RANGE
-    return np.clip((np.abs(picture.rgb - plate.rgb).max(axis=-1) - low) / (high - low), 0, 1)
+    nearer = 1 - np.minimum(picture.depth, NOTHING) / np.clip(plate.depth, 1e-9, NOTHING)
+    by_colour = _ramp(np.abs(picture.rgb - plate.rgb).max(axis=-1), MATTE_RANGE)
+    return np.maximum(by_colour, picture.opacity * _ramp(nearer, NEARER_RANGE))
+
+
+def _ramp(values: np.ndarray, between: tuple[float, float]) -> np.ndarray:
+    """Return how far values are on their way from one limit to the other, in [0, 1]."""
+    low, high = between
+    return np.clip((values - low) / (high - low), 0, 1)
 
 
 def motion_colours(picture: Rendering, share: np.ndarray) -> Rendering:

@@ -91,6 +91,13 @@ def _add_cameras(group: argparse._ArgumentGroup) -> None:
         metavar="N",
         help="N views along a path around the scene while the clip plays once",
     )
+    cameras.add_argument(
+        "--every-camera",
+        action="store_const",
+        const=True,
+        help="every frame by every camera of the scene: pictures in a folder, with a transforms.json, on which kpenc "
+        "trains",
+    )
     group.add_argument(
         "--size", type=size, metavar="WxH", help="size of the pictures; the vertical field of view stays the same"
     )
@@ -158,6 +165,17 @@ def _add_content(group: argparse._ArgumentGroup) -> None:
         metavar="static|dynamic",
         help="static: what the space planes alone show, time planes set to 1, which no one ever saw; dynamic: the "
         "absolute difference of the picture from that",
+    )
+    group.add_argument(
+        "--with",
+        dest="others",
+        type=cli.file_name,
+        action="append",
+        default=[],
+        metavar="SCENE",
+        help="draw another scene, a file or its http address, into the pictures, too, where kpedit has placed it; what "
+        "is nearer covers what is farther; all clips begin together, and the last frame of one that is shorter than "
+        "the first stays; may be given several times",
     )
     group.add_argument(
         "--background",

@@ -99,33 +99,39 @@ def _write_exr(path: Path, picture: Rendering, is_transparent: bool) -> None:
             raise MediaError(f"{path}: cannot be written ({reason.rstrip('.')})") from error
 
 
-def max_depth(scene: Scene, cameras: Sequence[Camera]) -> float:
-    """Return a depth that no surface exceeds: the greatest distance from a camera to a corner of the scene's bounds.
+def max_depth(scenes: Sequence[Scene], cameras: Sequence[Camera]) -> float:
+    """Return a depth that no surface exceeds: the greatest distance from a camera to a corner of the scenes' bounds.
 
     In contracted space it is a limit to which depth is clipped.
     """
-    if isinstance(scene.mapping, Contraction):
-        return CONTRACTED_DEPTH_RANGE * scene.mapping.uniform_distance
-    corners = np.array(list(itertools.product(*scene.bounds.T)))
+    if contraction := _contraction_of(scenes):
+        return CONTRACTED_DEPTH_RANGE * contraction.uniform_distance
+    corners = np.array([corner for scene in scenes for corner in itertools.product(*scene.bounds.T)])
     eyes = np.unique([camera.camera_to_world[:3, 3] for camera in cameras], axis=0)
     return float(np.linalg.norm(eyes[:, None] - corners, axis=2).max())
 
 
-def depth_unit(scene: Scene, cameras: Sequence[Camera]) -> float:
+def depth_unit(scenes: Sequence[Scene], cameras: Sequence[Camera]) -> float:
     """Return the distance that a level of a depth PNG stands for, world units."""
-    return max_depth(scene, cameras) / (NO_SURFACE - 1)
+    return max_depth(scenes, cameras) / (NO_SURFACE - 1)
 
 
-def depth_pixels(scene: Scene, cameras: Sequence[Camera], bits: int) -> Callable[[Rendering], np.ndarray]:
+def _contraction_of(scenes: Sequence[Scene]) -> Contraction | None:
+    """Return the contraction that reaches farthest; None if no scene is in contracted space."""
+    found = [scene.mapping for scene in scenes if isinstance(scene.mapping, Contraction)]
+    return max(found, key=lambda mapping: mapping.uniform_distance, default=None)
+
+
+def depth_pixels(scenes: Sequence[Scene], cameras: Sequence[Camera], bits: int) -> Callable[[Rendering], np.ndarray]:
     """Return a function that shows depth in grey: near is white, far and empty are black.
 
     Grey is linear in depth, or in contracted space in the ray's parameter, along which samples are evenly spaced.
     """
-    mapping, farthest = scene.mapping, max_depth(scene, cameras)
+    mapping, farthest = _contraction_of(scenes), max_depth(scenes, cameras)
     kind = np.uint8 if bits == 8 else np.uint16
 
     def pixels(picture: Rendering) -> np.ndarray:
-        if isinstance(mapping, Contraction):
+        if mapping is not None:
             brightness = 1 - mapping.parameter(picture.depth) / (2 * mapping.uniform_distance)
         else:
             relative = np.minimum(picture.depth / farthest, 1)

@@ -27,7 +27,7 @@ UNKNOWN = "pictures of unknown origin"
 CHECKSUM = "SHA-256 "
 PICTURES = {".png", ".jpg", ".jpeg", ".exr"}
 # Options whose name on the command line differs from that of their value.
-NAMES = {"content": "what is shown", "part": "--diagnose", "scene": "the scene"}
+NAMES = {"content": "what is shown", "part": "--diagnose", "scene": "the scene", "others": "--with"}
 
 
 @contextlib.contextmanager
@@ -132,17 +132,24 @@ def described(options: argparse.Namespace) -> dict[str, Any]:
     for name, value in sorted(vars(options).items()):
         if name in FREE:
             continue
-        if isinstance(value, Enum):
-            value = value.value
-        elif isinstance(value, np.ndarray):
-            value = [float(number) for number in value]
-        elif isinstance(value, str | Path) and Path(value).is_file():
-            value = f"{Path(value).name}, {_checksum(Path(value).read_bytes())}"
-        elif isinstance(value, str) and is_url(value):
-            address = Address.parse(value)  # the query may say which scene it is; user and password do not
-            value = f"{address.name}, address of {_checksum(address.url.encode())}"
-        found[name] = value if isinstance(value, int | float | list | None) else str(value)
+        found[name] = _described(value)
     return found
+
+
+def _described(value: Any) -> Any:
+    """Return the value of an option as JSON, a file by its name and content."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, np.ndarray):
+        return [float(number) for number in value]
+    if isinstance(value, list):
+        return [_described(one) for one in value] or None
+    if isinstance(value, str | Path) and Path(value).is_file():
+        return f"{Path(value).name}, {_checksum(Path(value).read_bytes())}"
+    if isinstance(value, str) and is_url(value):
+        address = Address.parse(value)  # the query may say which scene it is; user and password do not
+        return f"{address.name}, address of {_checksum(address.url.encode())}"
+    return value if isinstance(value, int | float | None) else str(value)
 
 
 def _checksum(content: bytes) -> str:
@@ -151,11 +158,15 @@ def _checksum(content: bytes) -> str:
 
 def _identity(value: Any) -> Any:
     """Return what distinguishes one value from another: of files their content, since they may be renamed."""
+    if isinstance(value, list):
+        return [_identity(one) for one in value]
     return value[value.index(CHECKSUM) :] if isinstance(value, str) and CHECKSUM in value else value
 
 
 def _shown(value: Any) -> str:
     """Return a value as the command line takes it: a size as 640x480, a colour as #ffffff."""
+    if isinstance(value, list) and isinstance(value[0], str):
+        return ", ".join(value)
     if isinstance(value, list):
         return "#" + "".join(f"{round(255 * part):02x}" for part in value)
     return "not given" if value is None else re.sub(r"\((\d+), (\d+)\)", r"\1x\2", str(value))

@@ -6,7 +6,9 @@ Time is continuous: frame n of a film is at n / fps seconds, whatever the rate o
 
 import argparse
 import math
-from collections.abc import Callable, Iterator
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -53,46 +55,72 @@ class Timeline:
 
 @dataclass(frozen=True)
 class Shots:
-    """The frames to render.
+    """The pictures to render: one of each frame, or one of each frame by each camera of a rig, camera by camera.
 
     Attributes:
         timeline: all frames.
-        numbers: of those to render.
+        frames: the numbers of those to render.
         fps: frames per second of a film of them, which plays as fast as the clip.
         shutter: the part of a frame's time for which the shutter is open, 0 for an instant.
+        rig: the names and cameras that see every frame; none where the timeline has the camera of each.
     """
 
     timeline: Timeline
-    numbers: range
+    frames: range
     fps: float
     shutter: float
+    rig: tuple[tuple[str, Camera], ...] = ()
 
     def __len__(self) -> int:
-        return len(self.numbers)
+        return len(self.frames) * max(len(self.rig), 1)
+
+    @property
+    def numbers(self) -> range:
+        """The numbers of the pictures, by which the other members know them."""
+        return range(len(self)) if self.rig else self.frames
 
     def name(self, number: int) -> str:
-        """Return what a frame is called."""
-        return f"{number:04d}" if self.timeline.names is None else self.timeline.names[number]
+        """Return what a picture is called."""
+        frame, seen_by = self._parts(number)
+        name = f"{frame:04d}" if self.timeline.names is None else self.timeline.names[frame]
+        return name if seen_by is None else f"{seen_by[0]}_{name}"
 
     def camera(self, number: int) -> Camera:
-        """Return the camera of a frame."""
-        return self.timeline.at(number)[0]
+        """Return the camera of a picture."""
+        return self._at(number)[0]
 
     def time(self, number: int) -> float:
-        """Return the clip's time of a frame, in [0, 1]."""
-        return self.timeline.at(number)[1]
+        """Return the clip's time of a picture, in [0, 1]."""
+        return self._at(number)[1]
+
+    def place(self, number: int) -> float:
+        """Return the time of a picture, which is 0 in the first and 1 in the last of the frames that are rendered."""
+        return self.frames.index(self._parts(number)[0]) / max(len(self.frames) - 1, 1)
 
     def instants(self, number: int) -> list[tuple[Camera, float]]:
-        """Return the cameras and times whose mean a frame is: one, or several evenly over the time that the shutter is
-        open, the middle of which is the frame's."""
+        """Return the cameras and times whose mean a picture is: one, or several evenly over the time that the shutter
+        is open, the middle of which is the frame's."""
         if self.shutter == 0:
-            return [self.timeline.at(number)]
+            return [self._at(number)]
         steps = (np.arange(SHUTTER_INSTANTS) + 0.5) / SHUTTER_INSTANTS - 0.5
-        return [self.timeline.at(number + self.shutter * float(step)) for step in steps]
+        return [self._at(number, self.shutter * float(step)) for step in steps]
 
     def times(self) -> Iterator[float]:
-        """Yield the clip's times of all instants of all frames."""
+        """Yield the clip's times of all instants of all pictures."""
         return (time for number in self.numbers for _, time in self.instants(number))
+
+    def _parts(self, number: int) -> tuple[int, tuple[str, Camera] | None]:
+        """Return the frame of a picture, and which camera of the rig sees it."""
+        if not self.rig:
+            return number, None
+        camera, frame = divmod(number, len(self.frames))
+        return self.frames[frame], self.rig[camera]
+
+    def _at(self, number: int, later: float = 0.0) -> tuple[Camera, float]:
+        """Return the camera and the clip's time of a picture, or of so many frames later."""
+        frame, seen_by = self._parts(number)
+        camera, time = self.timeline.at(frame + later)
+        return (camera if seen_by is None else seen_by[1]), time
 
 
 def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bool) -> Shots:
@@ -128,13 +156,15 @@ def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: boo
         last = last if end_s is None else min(last, math.ceil(end_s * fps - SLACK) - 1)
         if first > last:
             raise UsageError(f"--from {start_s:g}s --to {end_s:g}s: no frame lies between them; swap or widen them")
-    numbers = range(first, last + 1, options.step)
-    if len(numbers) > MAX_PICTURES:
+    frames, rig = range(first, last + 1, options.step), _rig(scene, options) if options.every_camera else ()
+    shots = Shots(timeline, frames, fps / options.step, options.shutter, rig)
+    if len(frames) * max(len(rig), 1) > MAX_PICTURES:
+        by_each = f" by {len(rig)} cameras" if rig else ""
         raise UsageError(
-            f"{len(numbers):,} frames are more than {MAX_PICTURES:,} pictures; choose fewer by --frames, --from "
-            "and --to, a larger --step, or a lower --fps"
+            f"{len(frames):,} frames{by_each} are more than {MAX_PICTURES:,} pictures; choose fewer by --frames, "
+            "--from and --to, a larger --step, or a lower --fps"
         )
-    return Shots(timeline, numbers, fps / options.step, options.shutter)
+    return shots
 
 
 def _check_rate_and_step(options: argparse.Namespace, is_still: bool, is_film: bool) -> None:
@@ -182,8 +212,7 @@ def _timeline(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bo
     fixed_time: float | None = options.time
 
     def fitted(camera: Camera) -> Camera:
-        _check_distance(scene, camera)
-        return camera if options.size is None else fit_camera(camera, *options.size)
+        return _fitted(scene, camera, options)
 
     if options.path is not None:
         path = CameraPath.load(options.path)
@@ -218,16 +247,43 @@ def _timeline(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bo
     return Timeline(count, fps, lambda frame: (camera, _clamped(frame * clip_frames / last_frame)))
 
 
-def _check_distance(scene: Scene, camera: Camera) -> None:
+def _rig(scene: Scene, options: argparse.Namespace) -> tuple[tuple[str, Camera], ...]:
+    """Return the cameras that see every frame, with names for their files."""
+    if not scene.cameras:
+        raise UsageError("--every-camera: the file lists no cameras; give --cameras")
+    names = _file_names(scene.metadata.names_of(len(scene.cameras)))
+    return tuple((name, _fitted(scene, camera, options)) for name, camera in zip(names, scene.cameras, strict=True))
+
+
+def _file_names(names: Sequence[str]) -> list[str]:
+    """Return names of cameras that files can have, each once: the same whatever frames are rendered."""
+    plain = [re.sub(r"[^\w.+ -]", "_", name)[-100:].lstrip(". ") for name in names]
+    counts = Counter(name.casefold() for name in plain)
+    is_kept = all(plain) and max(counts.values()) == 1
+    return plain if is_kept else [f"{number}_{name}" for number, name in enumerate(plain)]
+
+
+def _fitted(scene: Scene, camera: Camera, options: argparse.Namespace) -> Camera:
+    """Return a camera at the size that is asked for."""
+    check_distance(scene, camera)
+    return camera if options.size is None else fit_camera(camera, *options.size)
+
+
+def check_distance(scene: Scene, camera: Camera, where: str = "") -> None:
     """Refuse a camera from which float32 cannot tell samples apart; in contracted space and NDC it can from anywhere.
+
+    Args:
+        scene: the scene.
+        camera: the camera.
+        where: the beginning of the message.
 
     Raises:
         UsageError: the camera is too far away.
     """
     if scene.mapping is None and (away := edges_away(scene.aabb, camera.camera_to_world[:3, 3])) > FARTHEST_CAMERA:
         raise UsageError(
-            f"a camera is {away:,.0f} times the longest edge of the scene's box away from it, where numbers are too "
-            f"coarse (at most {FARTHEST_CAMERA:,.0f}); move it closer and shorten its focal length"
+            f"{where}a camera is {away:,.0f} times the longest edge of the scene's box away from it, where numbers are "
+            f"too coarse (at most {FARTHEST_CAMERA:,.0f}); move it closer and shorten its focal length"
         )
 
 
