@@ -146,7 +146,7 @@ class Stream:
                 self._interrupt_for(head.time)
 
     def upload(self, renderer: Renderer, max_bytes: float = UPLOAD_BYTES) -> bool:
-        """Take over finished segments. The space planes of a finer scale are complete once it can be shown at once.
+        """Take over finished segments. The last space plane of a finer scale waits for the scale's time planes.
 
         Args:
             renderer: the renderer of the scene.

@@ -78,12 +78,12 @@ class Output:
         if not self.is_folder:
             return [self.path], []
         bare = [re.split(r"[/\\]", _without_suffix(name))[-1] for name in names]
-        repeated = {stem for stem, count in Counter(map(_plain, bare)).items() if count > 1}
+        repeated = {stem for stem, count in Counter(map(plain_name, bare)).items() if count > 1}
         paths, used, renamed = [], set[str](), list[tuple[str, str]]()
         for number, name in enumerate(names):
-            stem = _plain(bare[number])
+            stem = plain_name(bare[number])
             if stem in repeated:  # none keeps it, else the pictures of one folder would pass for those of another
-                stem = _plain(_without_suffix(name))
+                stem = plain_name(_without_suffix(name))
             stem = stem or f"{number:04d}"
             while used & (taken := self._stems(stem, with_depth)):
                 stem = f"{stem}_{number:04d}"
@@ -102,9 +102,9 @@ def _without_suffix(name: str) -> str:
     return name.rsplit(".", 1)[0] if _is_of_media(name) else name
 
 
-def _plain(name: str) -> str:
-    """Return a name of letters, digits, spaces and some signs, which is no path, not hidden, and begins visibly."""
-    return re.sub(r"[^\w.+ -]", "_", name)[-120:].lstrip(". ")
+def plain_name(name: str, most: int = 120) -> str:
+    """Return a name of at most so many letters, digits, spaces and some signs, which is no path and not hidden."""
+    return re.sub(r"[^\w.+ -]", "_", name)[-most:].lstrip(". ")
 
 
 def _is_of_media(name: str) -> bool:

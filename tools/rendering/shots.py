@@ -5,8 +5,8 @@ Time is continuous: frame n of a film is at n / fps seconds, whatever the rate o
 """
 
 import argparse
+import functools
 import math
-import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +23,7 @@ from kpc.format.scene.scene import Clip, Scene
 from kpc.format.scene.space import FARTHEST_CAMERA, edges_away
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.viewpoints import fit_camera, orbit
+from kpc.tools.rendering.outputs import plain_name
 
 # Limits of --fps, of the number of pictures, and of the frames of a clip among which they are chosen.
 MIN_FPS, MAX_FPS = 0.001, 240.0
@@ -211,8 +212,7 @@ def _timeline(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bo
     clip_frames, last_frame = clip.fps / fps, max(clip.frame_count - 1, 1)
     fixed_time: float | None = options.time
 
-    def fitted(camera: Camera) -> Camera:
-        return _fitted(scene, camera, options)
+    fitted = functools.partial(_fitted, scene, options)
 
     if options.path is not None:
         path = CameraPath.load(options.path)
@@ -252,18 +252,18 @@ def _rig(scene: Scene, options: argparse.Namespace) -> tuple[tuple[str, Camera],
     if not scene.cameras:
         raise UsageError("--every-camera: the file lists no cameras; give --cameras")
     names = _file_names(scene.metadata.names_of(len(scene.cameras)))
-    return tuple((name, _fitted(scene, camera, options)) for name, camera in zip(names, scene.cameras, strict=True))
+    return tuple((name, _fitted(scene, options, camera)) for name, camera in zip(names, scene.cameras, strict=True))
 
 
 def _file_names(names: Sequence[str]) -> list[str]:
     """Return names of cameras that files can have, each once: the same whatever frames are rendered."""
-    plain = [re.sub(r"[^\w.+ -]", "_", name)[-100:].lstrip(". ") for name in names]
+    plain = [plain_name(name, most=100) for name in names]  # which leaves room for the frame
     counts = Counter(name.casefold() for name in plain)
     is_kept = all(plain) and max(counts.values()) == 1
     return plain if is_kept else [f"{number}_{name}" for number, name in enumerate(plain)]
 
 
-def _fitted(scene: Scene, camera: Camera, options: argparse.Namespace) -> Camera:
+def _fitted(scene: Scene, options: argparse.Namespace, camera: Camera) -> Camera:
     """Return a camera at the size that is asked for."""
     check_distance(scene, camera)
     return camera if options.size is None else fit_camera(camera, *options.size)

@@ -48,8 +48,8 @@ def write_transforms(folder: Path, shots: Shots, paths: Sequence[Path]) -> None:
     """
     frames = [_frame(shots, number, path) for number, path in zip(shots.numbers, paths, strict=True)]
     clip = {"fps": shots.fps, "frame_count": len(shots.frames)} if len(shots.frames) > 1 else {}
-    count = len(shots.frames)
-    tests = [path.name for number, path in enumerate(paths) if (number // count + number % count) % HOLD_OUT_EVERY == 0]
+    places = (divmod(number, len(shots.frames)) for number in range(len(paths)))  # the camera and the frame of each
+    tests = [path.name for path, place in zip(paths, places, strict=True) if sum(place) % HOLD_OUT_EVERY == 0]
     document = {"made_by": MADE_BY, **clip, "test_filenames": tests if len(paths) > 1 else [], "frames": frames}
     with atomic_write(folder / NAME) as temporary:
         temporary.write_text(json.dumps(document, indent=1) + "\n")
