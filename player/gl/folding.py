@@ -3,8 +3,11 @@ texels.
 
 The product is exact at the texels that are written. Between them the product of two interpolations becomes the
 interpolation of a product, an error that falls with the square of the distance between texels; so planes and rows are
-upsampled along the row first.
+upsampled along the row first. Planes whose rows are those that were folded before are not folded again, such as all of
+a scale for what stays.
 """
+
+from collections.abc import Sequence
 
 import moderngl
 import numpy as np
@@ -64,6 +67,7 @@ class FoldedPlanes:
             self._upsampled.filter = self._rows.filter = moderngl.NEAREST, moderngl.NEAREST
             self._upsample_into, self._fold_into = ctx.framebuffer([self._upsampled]), ctx.framebuffer([self._planes])
         self._time: float | None = None
+        self._folded_rows: np.ndarray | None = None  # as `TimeRows.at`
         self._is_upsampled, self._is_checked = False, True
 
     @property
@@ -75,7 +79,7 @@ class FoldedPlanes:
         return self._planes.dtype
 
     def planes_changed(self) -> None:
-        self._time, self._is_upsampled, self._is_checked = None, False, False
+        self._time, self._folded_rows, self._is_upsampled, self._is_checked = None, None, False, False
 
     def time_planes_changed(self) -> None:
         self._time, self._is_checked = None, False
@@ -86,16 +90,25 @@ class FoldedPlanes:
             self._check_dtype()
         if not self._is_upsampled:
             self._textures.planes.use(PLANES_UNIT)
-            self._draw_blocks("upsample_plane.glsl", self._upsample_into)
+            self._draw_blocks("upsample_plane.glsl", self._upsample_into, range(len(self.layout.blocks)))
             self._is_upsampled = True
         if time != self._time:
             assert self._textures.time_rows is not None
-            self._rows.write(self._textures.time_rows.at(time, self.layout.upsampling))
+            rows = self._textures.time_rows.at(time, self.layout.upsampling)
+            self._rows.write(rows)
             self._upsampled.use(PLANES_UNIT)
             self._rows.use(ROWS_UNIT)
-            self._draw_blocks("fold.glsl", self._fold_into)
-            self._time = time
+            stale, self._folded_rows = self._stale_blocks(rows), None
+            self._draw_blocks("fold.glsl", self._fold_into, stale)
+            self._time, self._folded_rows = time, rows
         return self._planes
+
+    def _stale_blocks(self, rows: np.ndarray) -> list[int]:
+        """Return the numbers of the blocks with which other rows are folded now."""
+        before, lines = self._folded_rows, [self.layout.lines(block) for block in self.layout.blocks]
+        if before is None:
+            return list(range(len(lines)))
+        return [number for number, used in enumerate(lines) if not np.array_equal(rows[used], before[used])]
 
     def _check_dtype(self) -> None:
         """Make folded planes of another type where what has changed in the scene needs it."""
@@ -108,9 +121,10 @@ class FoldedPlanes:
         with allocation(ctx, "the folded planes"):
             self._planes = plane_texture(ctx, self.layout.size, dtype)
             self._fold_into = ctx.framebuffer([self._planes])
+        self._folded_rows = None
 
-    def _draw_blocks(self, name: str, into: moderngl.Framebuffer) -> None:
-        """Draw each plane by a shader that takes as uniforms where it lies and which rows go with it."""
+    def _draw_blocks(self, name: str, into: moderngl.Framebuffer, numbers: Sequence[int]) -> None:
+        """Draw some planes by a shader that takes as uniforms where they lie and which rows go with them."""
         source = self._textures.layout
         program, vertices = self._programs.get(name, source)
         set_uniforms(
@@ -120,7 +134,8 @@ class FoldedPlanes:
             folded_rows_texel=tuple(1 / side for side in self._rows.size),
             largest=LARGEST_HALF if self.dtype == "f2" else LARGEST_SINGLE,
         )
-        for block, written in zip(source.blocks, self.layout.blocks, strict=True):
+        for number in numbers:
+            block, written = source.blocks[number], self.layout.blocks[number]
             lines = self.layout.lines(written)
             set_uniforms(
                 program,

@@ -17,8 +17,9 @@ from kpc.format.common.errors import DisplayError
 from kpc.format.container import scene_io
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rig import Rig
-from kpc.format.scene.scene import Scene
+from kpc.format.scene.scene import TIME_PLANES, Scene
 from kpc.player.cpu.reference import Part, Rendering, render
+from kpc.player.gl import folding, programs
 from kpc.player.gl.folding import folded_layout
 from kpc.player.gl.presentation import DisplayMode
 from kpc.player.gl.renderer import Renderer
@@ -301,6 +302,33 @@ def test_planes_that_fit_only_without_upsampling_are_folded_so(monkeypatch: pyte
     assert folded_layout(renderer._textures) is renderer.layout
     error = renderer.render(CAMERAS["outside"], 0.7).rgb - render(scene, CAMERAS["outside"], 0.7).rgb
     assert -10 * np.log10(np.mean(error**2)) > 40
+
+
+def test_planes_are_folded_again_only_with_other_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    moving = tiny_scene(4)
+    still = {name: np.ones_like(plane) if name in TIME_PLANES else plane for name, plane in moving.scales[0].items()}
+    scene = replace(moving, scales=(still, moving.scales[1]))
+    renderer, drawn = Renderer(gl.context(), scene, FOLDED, processor=False), []
+
+    def draw(*arguments: object) -> None:
+        drawn.append(arguments)
+        programs.draw(*arguments)
+
+    def blocks_for(time: float) -> int:
+        drawn.clear()
+        picture = renderer.render(CAMERAS["outside"], time)
+        count = len(drawn)
+        first = Renderer(gl.context(), scene, FOLDED, processor=False)
+        assert np.array_equal(picture.rgb, first.render(CAMERAS["outside"], time).rgb)
+        return count
+
+    monkeypatch.setattr(folding, "draw", draw)
+    # upsampled and folded; then those of the scale that moves
+    assert [blocks_for(time) for time in (0.2, 0.2, 0.7, 0.2)] == [6 + 6, 0, 3, 3]
+    for factor, count in ((0.5, 1), (1e5, 6)):  # one plane; all in float32, since float16 does not hold them
+        scene.scales[1]["xt"][:] *= factor
+        renderer.refresh()
+        assert blocks_for(0.2) == count
 
 
 def test_a_picture_too_large_for_the_card_is_refused() -> None:
