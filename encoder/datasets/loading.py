@@ -3,6 +3,7 @@
 import hashlib
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -224,7 +225,7 @@ def _load(
         near=np.array([v.near for v in views], np.float32)[view_of],
         far=np.array([v.far for v in views], np.float32)[view_of],
     )
-    names = tuple(valid_unicode(views[view_of[p]].camera or Path(files[p]).stem) for p in first)
+    names = _camera_names([views[view_of[p]].camera for p in first], [Path(files[p]).stem for p in first])
     if masks is not None and not masks.counts[~pictures.is_test].any():
         raise DatasetError(
             f"{root}: its masks ignore every pixel to train on (0 means ignored); invert the masks or remove them"
@@ -282,6 +283,14 @@ def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray,
     steps = np.diff(np.unique(np.round(times[[not view.is_test for view in capture.views]], 6)))
     count = min(1 + round(1 / float(np.median(steps))), len(times)) if len(steps) else 1
     return still, times, replace(clip, frame_count=count), None
+
+
+def _camera_names(given: Sequence[str | None], stems: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of cameras: those that are given, or, where several have the same or none, those of files."""
+    counts = Counter(given)
+    return tuple(
+        valid_unicode(name if name and counts[name] == 1 else stem) for name, stem in zip(given, stems, strict=True)
+    )
 
 
 def _name(root: Path, capture: Capture, view: CapturedView) -> str:

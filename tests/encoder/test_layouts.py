@@ -219,6 +219,7 @@ def test_fisheye_of_instant_ngp(tmp_path: Path) -> None:
     [
         ({"camera_model": "THIN_PRISM_FISHEYE"}, "THIN_PRISM_FISHEYE is not supported; undistort"),
         ({"camera_model": "VR180_L"}, "VR180_L is not supported"),
+        ({"camera_name": [3]}, "camera_name is no text; correct it"),
         ({"camera_model": "a model of 2031"}, "a model of 2031 is not supported"),
         ({"camera_type": "fisheye", "p1": 0.1}, "p1 of a camera model that is a fisheye"),
         ({"is_fisheye": True, "camera_model": "PINHOLE"}, "is_fisheye contradicts camera model PINHOLE"),

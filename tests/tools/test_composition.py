@@ -157,7 +157,7 @@ def test_every_camera_makes_a_folder_that_trains(run: Run, tmp_path: Path) -> No
     assert load_dataset(out, tmp_path / "cache").pictures.is_test.sum() == 1
     dataset = load_dataset(out, tmp_path / "cache", holdout="none")
     assert dataset.has_alpha and dataset.clip == Clip(4, 5.0) and len(dataset.pictures) == 8
-    assert dataset.left_out == 0
+    assert dataset.left_out == 0 and dataset.camera_names == ("left", "right")
     for number, path in enumerate(dataset.pictures.file):
         name, frame = Path(path).stem.split("_")
         assert dataset.pictures.time[number] == pytest.approx((int(frame) - 2) / 6)

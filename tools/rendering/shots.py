@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,6 +55,14 @@ class Timeline:
     is_stopped: bool = False
 
 
+class RigCamera(NamedTuple):
+    """A camera that sees every frame, with its name, and the name that its files begin with."""
+
+    name: str
+    file_name: str
+    camera: Camera
+
+
 @dataclass(frozen=True)
 class Shots:
     """The pictures to render: one of each frame, or one of each frame by each camera of a rig, camera by camera.
@@ -63,14 +72,14 @@ class Shots:
         frames: the numbers of those to render.
         fps: frames per second of a film of them, which plays as fast as the clip.
         shutter: the part of a frame's time for which the shutter is open, 0 for an instant.
-        rig: the names and cameras that see every frame; none where the timeline has the camera of each.
+        rig: the cameras that see every frame; none where the timeline has the camera of each.
     """
 
     timeline: Timeline
     frames: range
     fps: float
     shutter: float
-    rig: tuple[tuple[str, Camera], ...] = ()
+    rig: tuple[RigCamera, ...] = ()
 
     def __len__(self) -> int:
         return len(self.frames) * max(len(self.rig), 1)
@@ -84,11 +93,16 @@ class Shots:
         """Return what a picture is called."""
         frame, seen_by = self._parts(number)
         name = f"{frame:04d}" if self.timeline.names is None else self.timeline.names[frame]
-        return name if seen_by is None else f"{seen_by[0]}_{name}"
+        return name if seen_by is None else f"{seen_by.file_name}_{name}"
 
     def camera(self, number: int) -> Camera:
         """Return the camera of a picture."""
         return self._at(number)[0]
+
+    def camera_name(self, number: int) -> str | None:
+        """Return which camera of the rig sees a picture; None where there is none."""
+        seen_by = self._parts(number)[1]
+        return None if seen_by is None else seen_by.name
 
     def time(self, number: int) -> float:
         """Return the clip's time of a picture, in [0, 1]."""
@@ -110,7 +124,7 @@ class Shots:
         """Yield the clip's times of all instants of all pictures."""
         return (time for number in self.numbers for _, time in self.instants(number))
 
-    def _parts(self, number: int) -> tuple[int, tuple[str, Camera] | None]:
+    def _parts(self, number: int) -> tuple[int, RigCamera | None]:
         """Return the frame of a picture, and which camera of the rig sees it."""
         if not self.rig:
             return number, None
@@ -121,7 +135,7 @@ class Shots:
         """Return the camera and the clip's time of a picture, or of so many frames later."""
         frame, seen_by = self._parts(number)
         camera, time = self.timeline.at(frame + later)
-        return (camera if seen_by is None else seen_by[1]), time
+        return (camera if seen_by is None else seen_by.camera), time
 
 
 def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bool) -> Shots:
@@ -247,12 +261,13 @@ def _timeline(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bo
     return Timeline(count, fps, lambda frame: (camera, _clamped(frame * clip_frames / last_frame)))
 
 
-def _rig(scene: Scene, options: argparse.Namespace) -> tuple[tuple[str, Camera], ...]:
-    """Return the cameras that see every frame, with names for their files."""
+def _rig(scene: Scene, options: argparse.Namespace) -> tuple[RigCamera, ...]:
+    """Return the cameras that see every frame."""
     if not scene.cameras:
         raise UsageError("--every-camera: the file lists no cameras; give --cameras")
-    names = _file_names(scene.metadata.names_of(len(scene.cameras)))
-    return tuple((name, _fitted(scene, options, camera)) for name, camera in zip(names, scene.cameras, strict=True))
+    names = scene.metadata.names_of(len(scene.cameras))
+    cameras = [_fitted(scene, options, camera) for camera in scene.cameras]
+    return tuple(map(RigCamera, names, _file_names(names), cameras))
 
 
 def _file_names(names: Sequence[str]) -> list[str]:

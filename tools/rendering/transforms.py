@@ -60,4 +60,13 @@ def _frame(shots: Shots, number: int, path: Path) -> dict[str, Any]:
     time = {"time": shots.place(number)} if len(shots.frames) > 1 else {}
     lens = {name: getattr(camera, name) for name in ("fl_x", "fl_y", "cx", "cy")}
     pose = camera.camera_to_world.tolist()
-    return {"file_path": path.name, **time, "w": camera.width, "h": camera.height, **lens, "transform_matrix": pose}
+    name = {} if (seen_by := shots.camera_name(number)) is None else {"camera_name": seen_by}
+    return {
+        "file_path": path.name,
+        **name,
+        **time,
+        "w": camera.width,
+        "h": camera.height,
+        **lens,
+        "transform_matrix": pose,
+    }

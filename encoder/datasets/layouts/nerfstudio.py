@@ -124,4 +124,4 @@ def _named_by_folder(path: Path, views: tuple[CapturedView, ...]) -> tuple[Captu
     names = [view.file.relative_to(path).with_suffix("").as_posix() for view in views]
     if len({name.partition("/")[0] for name in names}) == 1:  # the folder into which `kpposes` wrote all frames
         names = [name.partition("/")[2] for name in names]
-    return tuple(replace(view, camera=name) for view, name in zip(views, names, strict=True))
+    return tuple(replace(view, camera=view.camera or name) for view, name in zip(views, names, strict=True))

@@ -128,7 +128,7 @@ def frame_view(
         near=number_of(where, keys, "near", math.nan),
         far=number_of(where, keys, "far", math.nan),
     )
-    return replace(view, mask=_mask(root, file, where, keys, image))
+    return replace(view, mask=_mask(root, file, where, keys, image), camera=_camera_name(where, keys))
 
 
 def _video_view(where: str, keys: dict[str, Any], video: Path, is_test: bool) -> CapturedView:
@@ -141,7 +141,15 @@ def _video_view(where: str, keys: dict[str, Any], video: Path, is_test: bool) ->
     view = video_view(video, where, lens, pose_of(where, keys), is_test)
     near, far = number_of(where, keys, "near", math.nan), number_of(where, keys, "far", math.nan)
     check_depths(where, near, far)
-    return replace(view, near=near, far=far, clock=_clock(where, keys))
+    return replace(view, near=near, far=far, clock=_clock(where, keys), camera=_camera_name(where, keys))
+
+
+def _camera_name(where: str, keys: dict[str, Any]) -> str | None:
+    """Return the name that the document gives to a camera; None where it gives none."""
+    name = keys.get("camera_name")
+    if name is None or isinstance(name, str | int):
+        return None if name is None else str(name)
+    raise DatasetError(f"{where}: camera_name is no text; correct it")
 
 
 def _clock(where: str, keys: dict[str, Any]) -> tuple[float, float]:

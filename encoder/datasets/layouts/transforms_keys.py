@@ -18,7 +18,8 @@ from kpc.format.scene.camera_models import NO_PINHOLE_KEYS, check_unknown_keys
 # Keys that are read.
 READ = frozenset(
     "frames file_path transform_matrix time fps near far w h fl_x fl_y camera_angle_x camera_angle_y x_fov y_fov cx cy "
-    "k1 k2 p1 p2 k3 k4 k5 k6 distortion_params camera_model camera_type is_fisheye mask_path enable_ray_loading "
+    "k1 k2 p1 p2 k3 k4 k5 k6 distortion_params camera_model camera_name camera_type is_fisheye mask_path "
+    "enable_ray_loading "
     "train_filenames val_filenames test_filenames time_offset time_rate "
     "frame_count start_s videos bytes".split()
 )
