@@ -8,13 +8,16 @@ SPACE_TIME_AXES = (-4, *SPACE_AXES)
 
 
 def dilate(grid: np.ndarray, axes: tuple[int, ...] = SPACE_AXES) -> np.ndarray:
-    """Return the boolean grid dilated by one cell, in a box along `axes`: diagonal neighbours are set, too."""
+    """Return a grid in which each cell has the largest value in a box of three cells a side along `axes` around it.
+
+    A boolean grid is dilated by one cell, and diagonal neighbours are set, too.
+    """
     for axis in axes:
         low, high = [slice(None)] * grid.ndim, [slice(None)] * grid.ndim
         low[axis], high[axis] = slice(None, -1), slice(1, None)
         wide = grid.copy()
-        wide[tuple(low)] |= grid[tuple(high)]
-        wide[tuple(high)] |= grid[tuple(low)]
+        np.maximum(wide[tuple(low)], grid[tuple(high)], out=wide[tuple(low)])
+        np.maximum(wide[tuple(high)], grid[tuple(low)], out=wide[tuple(high)])
         grid = wide
     return grid
 

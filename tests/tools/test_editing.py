@@ -232,9 +232,11 @@ def test_a_cropped_scene_shows_the_cells_of_the_box_as_before(variant):
             assert not (other[name].coded & ~one[name].coded).any()
 
 
-def test_an_empty_box_is_refused():
-    with pytest.raises(UsageError, match="there is nothing"):
-        cropped(quantised(), np.array([[50.0] * 3, [51.0] * 3]))
+def test_a_box_that_is_empty_in_all_groups_is_refused(clip, capsys):
+    for source in (clip, clip.with_name("one.kpc")):
+        command = [str(source), "-o", str(clip.with_name("out.kpc")), "--box", "50,50,50,51,51,51"]
+        assert kpedit.main(command) == 2
+        assert "--box: there is nothing from [50.0, 50.0, 50.0] to [51.0, 51.0, 51.0]" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["transform", "transform-implied", "predictive-implied", "trellis"])

@@ -7,6 +7,7 @@
     kpedit in.kpc -o out.kpc --provenance made.json    members of the provenance, for files that do not say
     kpedit in.kpc -o out.kpc --no-provenance           leave out how the file was made
     kpedit in.kpc -o out.kpc --from 1.5s --to 4s       a part of the clip
+    kpedit in.kpc -o out.kpc --layer moving            what moves, or what stays
     kpedit in.kpc -o out.kpc --box -1,-1,0,1,1,2       what lies in a box
     kpedit in.kpc -o out.kpc --scale 0.01 --turn x:-90 --move 0,1,0
     kpedit in.kpc -o out.kpc --speed 0.5               half as fast; --fps 60 for more frames at the same speed
@@ -21,7 +22,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -46,6 +47,7 @@ from kpc.format.scene.view_limits import find_view, view_members
 from kpc.player.cpu import reference
 from kpc.tools.editing.clips import Edits, edit
 from kpc.tools.editing.cropping import holds_all
+from kpc.tools.editing.layers import Layer
 from kpc.tools.editing.placing import Placement, axis_turn
 from kpc.tools.editing.timing import MAX_FPS, MIN_FPS
 
@@ -71,7 +73,7 @@ def _command(argv: list[str]) -> None:
         notice("kpedit: --from, --to: widened to where the clip can be cut, it is kept as a whole")
         options.start = options.end = None
         size, kept_s = _write(options, groups, replace(edits, part_s=None))
-    is_part = kept_s is not None or options.box is not None
+    is_part = kept_s is not None or options.layer is not None or options.box is not None
     if is_part and size > options.scene.stat().st_size and _plane_bytes(Groups(options.output)) > _plane_bytes(groups):
         notice(
             "kpedit: larger than the source, since texels are predicted from less; kpenc makes it smaller, at a loss"
@@ -127,6 +129,11 @@ def _add_edits(parser: argparse.ArgumentParser) -> None:
         "--from", dest="start", type=cli.time_s, metavar="1.5s", help="keep the clip from then on (default: its start)"
     )
     parser.add_argument("--to", dest="end", type=cli.time_s, metavar="4s", help="keep the clip until then")
+    parser.add_argument(
+        "--layer",
+        choices=get_args(Layer),
+        help="keep what moves, or what stays, by the cells in which it is at each time",
+    )
     parser.add_argument(
         "--box",
         type=cli.box_corners,
@@ -184,7 +191,7 @@ def _edits_from(options: argparse.Namespace) -> Edits:
     if options.scale is not None or options.turn or options.move is not None:
         placement = Placement(_turn_of(options), options.scale or 1.0, np.array(options.move or (0.0, 0.0, 0.0)))
     box = None if options.box is None else np.reshape(options.box, (2, 3))
-    return Edits(part_s, box, placement, options.speed, options.fps)
+    return Edits(part_s, options.layer, box, placement, options.speed, options.fps)
 
 
 def _turn_of(options: argparse.Namespace) -> np.ndarray:
@@ -218,8 +225,9 @@ def _drop_idle(options: argparse.Namespace, groups: Groups) -> None:
 
 def _history(options: argparse.Namespace) -> list[str]:
     """Return what is done with the scene, in words for the history of the file."""
-    given = {"from": options.start, "to": options.end, "box": options.box, "scale": options.scale,
-             "turn": options.turn, "move": options.move, "speed": options.speed, "fps": options.fps}  # fmt: skip
+    given = {"from": options.start, "to": options.end, "layer": options.layer, "box": options.box,
+             "scale": options.scale, "turn": options.turn, "move": options.move, "speed": options.speed,
+             "fps": options.fps}  # fmt: skip
     words = [f"{name} {_in_words(value)}" for name, value in given.items() if value is not None]
     return [f"edited by kpc {VERSION}: {', '.join(words)}"[:256]] if words else []
 
@@ -256,7 +264,7 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace, placement:
     if options.open_at is not None or options.view_limits is not None:
         if (outside := opening_beyond_limits(metadata)) is not None:
             notice(f"kpedit: {outside}; --open-at sets another")
-    if options.start is not None or options.end is not None or options.box is not None:
+    if any(given is not None for given in (options.start, options.end, options.layer, options.box)):
         metadata = metadata.with_provenance(held_out=None, coding_loss_db=None)  # measured on the whole
     if options.provenance is not None:
         metadata = metadata.with_provenance(**_provenance_for(metadata, options))

@@ -1,7 +1,9 @@
-"""Edits of a file, a scene or a clip in groups, in the order in which they are made: part, box, place, time."""
+"""Edits of a file, a scene or a clip in groups, in the order in which they are made: part, layer, box, place, time."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +13,14 @@ from kpc.format.common.errors import FormatError, UsageError
 from kpc.format.common.progress import Progress, progress
 from kpc.format.container import groups, rewriting
 from kpc.format.container.groups import Span
+from kpc.format.container.partial import PartialScene
 from kpc.format.container.rewriting import with_metadata
+from kpc.format.container.scene_io import read
 from kpc.format.scene.metadata import Metadata
-from kpc.format.scene.scene import Clip
-from kpc.tools.editing.cropping import cropped, shared_texels
+from kpc.format.scene.scene import Clip, Scene
+from kpc.tools.editing.cropping import shared_texels, touched_cells, with_cells
 from kpc.tools.editing.files import edited
+from kpc.tools.editing.layers import Layer, Packed, find_layer
 from kpc.tools.editing.placing import Placement, placed, placed_metadata
 from kpc.tools.editing.timing import at_rate, at_speed, check_part, check_rate, check_speed, spans_at_rate, trimmed
 from kpc.tools.editing.unread import SharedTexels
@@ -27,6 +32,7 @@ class Edits:
 
     Attributes:
         part_s: from when to when to keep it, seconds.
+        layer: which layer to keep.
         box: (2, 3) lower and upper corner of what to keep, world units before placing.
         placement: where to put it.
         speed: how many times as fast to play it.
@@ -34,6 +40,7 @@ class Edits:
     """
 
     part_s: tuple[float, float] | None = None
+    layer: Layer | None = None
     box: np.ndarray | None = None
     placement: Placement | None = None
     speed: float | None = None
@@ -68,12 +75,16 @@ def edit(source: Path, output: Path, edits: Edits, metadata: Metadata) -> tuple[
     if not clip.is_single:
         return _edit_groups(clip, output, edits, metadata)
     kept: list[tuple[float, float]] = []
+    (layer,) = _layers(clip, [0], edits)
 
     def change(scene: QuantisedScene) -> QuantisedScene:
         if edits.part_s is not None:
             scene, span_s = trimmed(scene, *edits.part_s)
             kept.append(span_s)
-        return _retimed(_changed(scene, edits), edits)
+        cells = None if layer is None and edits.box is None else _kept_cells(scene.dequantise(), layer, edits)
+        if cells is not None and not cells.any():
+            raise _nothing(edits)
+        return _retimed(_changed(scene, edits, cells), edits)
 
     with Progress("editing", total=1, unit="scenes"):
         data = edited(clip.open(0), change)
@@ -109,20 +120,67 @@ def _edit_groups(
         except FormatError as error:
             raise UsageError(f"--fps {edits.fps:g}: at this rate the groups have too few or too many frames") from error
     parts = []
-    texels = [None] * len(numbers) if edits.box is None else shared_texels(clip, numbers, edits.box)
-    for number, span, shared in progress(list(zip(numbers, spans, texels, strict=True)), "editing", unit="groups"):
+    layers = _layers(clip, numbers, edits)
 
-        def change(scene: QuantisedScene, span: Span = span, shared: SharedTexels | None = shared) -> QuantisedScene:
+    def cells_of(k: int) -> np.ndarray | None:
+        if layers[k] is None and edits.box is None:
+            return None
+        return _kept_cells(PartialScene(clip.open(numbers[k])).scene, layers[k], edits)
+
+    if not any((cells := cells_of(k)) is None or cells.any() for k in range(len(numbers))):
+        raise _nothing(edits)
+    texels = shared_texels(clip, numbers, map(cells_of, range(len(numbers))))
+    for k, number in enumerate(progress(numbers, "editing", unit="groups")):
+
+        def change(scene: QuantisedScene, k: int = k) -> QuantisedScene:
             sound = scene.sound if edits.speed is None else None
-            return replace(_changed(scene, edits, shared), clip=Clip(span.count, edits.fps or fps), sound=sound)
+            changed = _changed(scene, edits, cells_of(k), texels[k])
+            return replace(changed, clip=Clip(spans[k].count, edits.fps or fps), sound=sound)
 
-        parts.append(groups.GroupInput.of(edited(clip.open(number), change), span.start))
+        parts.append(groups.GroupInput.of(edited(clip.open(number), change), spans[k].start))
     return groups.write(parts, output, metadata), kept
 
 
-def _changed(scene: QuantisedScene, edits: Edits, shared: SharedTexels | None = None) -> QuantisedScene:
-    if edits.box is not None:
-        scene = cropped(scene, edits.box, shared)
+def _layers(clip: groups.Groups, numbers: Sequence[int], edits: Edits) -> Sequence[Packed | None]:
+    """Return the cells of the layer that is kept of each of some groups; None where all is.
+
+    Raises:
+        UsageError: there is no such layer, or no such part.
+    """
+    if edits.layer is None:
+        return [None] * len(numbers)
+    whole = [partial(_opened, clip, number) for number in range(len(clip))]
+    if not clip.is_single:
+        return find_layer(edits.layer, [whole[number] for number in numbers], whole)
+    part_s = edits.part_s
+    if part_s is None or trimmed(read(clip.open(0)), *part_s)[1] == (0.0, clip.clip.duration_s):
+        return find_layer(edits.layer, whole, [])
+    return find_layer(edits.layer, [lambda: trimmed(read(clip.open(0)), *part_s)[0].dequantise()], whole)
+
+
+def _opened(clip: groups.Groups, number: int) -> Scene:
+    return read(clip.open(number)).dequantise()
+
+
+def _kept_cells(scene: Scene, layer: Packed | None, edits: Edits) -> np.ndarray:
+    """Return the cells that are kept, (K, Nz, Ny, Nx) bool."""
+    cells = scene.occupancy if layer is None else layer.array()
+    return cells if edits.box is None else cells & touched_cells(scene, edits.box)
+
+
+def _nothing(edits: Edits) -> UsageError:
+    """Return the error that nothing is left."""
+    assert edits.box is not None, "a layer holds something"
+    low, high = edits.box.tolist()
+    what = "" if edits.layer is None else f" of --layer {edits.layer}"
+    return UsageError(f"--box: there is nothing{what} from {low} to {high}")
+
+
+def _changed(
+    scene: QuantisedScene, edits: Edits, cells: np.ndarray | None, shared: SharedTexels | None = None
+) -> QuantisedScene:
+    if cells is not None:
+        scene = with_cells(scene, cells, shared)
     return scene if edits.placement is None else placed(scene, edits.placement)
 
 

@@ -1,13 +1,12 @@
-"""A part of a scene: the cells of its occupancy grid outside a box are emptied, and what nothing reads is left out."""
+"""A part of a scene: other cells of its occupancy grid are emptied, and what nothing reads is left out."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from kpc.format.coding.quantise import QuantisedScene, looked_up_cells, needed_texels
-from kpc.format.common.errors import UsageError
 from kpc.format.container.groups import Groups
 from kpc.format.container.partial import PartialScene
 from kpc.format.scene.scene import ALL_PLANES, Scene
@@ -15,41 +14,46 @@ from kpc.format.scene.space import Contraction, DeviceCoordinates, uncontract
 from kpc.tools.editing.unread import SharedTexels, without_unread
 
 
-def cropped(scene: QuantisedScene, box: np.ndarray, shared: SharedTexels | None = None) -> QuantisedScene:
-    """Return the part of a scene in the cells that a box touches; pictures of these cells stay as they are.
+def cropped(scene: QuantisedScene, box: np.ndarray) -> QuantisedScene:
+    """Return the part of a scene in the cells that a box, (2, 3) its corners in world units, touches."""
+    return with_cells(scene, scene.occupancy & touched_cells(scene.dequantise(), box))
+
+
+def with_cells(scene: QuantisedScene, cells: np.ndarray, shared: SharedTexels | None = None) -> QuantisedScene:
+    """Return the part of a scene in some of its cells, (K, Nz, Ny, Nx) bool; pictures of these stay as they are.
 
     Args:
         scene: of any mapping.
-        box: (2, 3) lower and upper corner, world units.
+        cells: its new occupancy grid, in any number of slots.
         shared: of a group, what `shared_texels` says.
-
-    Raises:
-        UsageError: the box holds nothing.
     """
-    inside = _touched_cells(scene.dequantise(), box)
-    occupancy = scene.occupancy & inside
-    if not occupancy.any():
-        raise UsageError(f"--box: there is nothing from {box[0].tolist()} to {box[1].tolist()}")
-    return without_unread(replace(scene, occupancy=occupancy), scene.occupancy, shared)
+    return without_unread(replace(scene, occupancy=cells), scene.occupancy, shared)
 
 
 def holds_all(clip: Groups, box: np.ndarray) -> bool:
     """Return whether a box touches all that any group holds, so that nothing is cropped."""
     scenes = (PartialScene(clip.open(number)).scene for number in range(len(clip)))
-    return not any((scene.occupancy & ~_touched_cells(scene, box)).any() for scene in scenes)
+    return not any((scene.occupancy & ~touched_cells(scene, box)).any() for scene in scenes)
 
 
-def shared_texels(clip: Groups, numbers: Sequence[int], box: np.ndarray) -> list[SharedTexels]:
-    """Return for each of some groups what any of them reads in a box of the planes that it shares."""
+def shared_texels(
+    clip: Groups, numbers: Sequence[int], cells: Iterable[np.ndarray | None]
+) -> list[SharedTexels | None]:
+    """Return for each of some groups what any of them reads of the planes that it shares; None where all is kept.
+
+    Args:
+        clip: the groups.
+        numbers: of those that are kept.
+        cells: of each of these the new occupancy grid, as `with_cells`; None of all where that stays.
+    """
     found: dict[tuple[int, ...], np.ndarray] = {}  # by chunk and shape
     places: list[dict[tuple[int, str], tuple[int, ...]]] = []
-    for number in numbers:
+    for number, occupancy in zip(numbers, cells, strict=True):
         reader = clip.open(number)
         places.append({})
-        if not reader.beside:
+        if occupancy is None or not reader.beside:
             continue
-        scene = PartialScene(reader).scene
-        inside = looked_up_cells(replace(scene, occupancy=scene.occupancy & _touched_cells(scene, box)))
+        inside = looked_up_cells(replace(PartialScene(reader).scene, occupancy=occupancy))
         for chunk, plane in reader.beside.items():
             entry = reader.index[chunk]
             name = ALL_PLANES[entry.plane]
@@ -58,11 +62,11 @@ def shared_texels(clip: Groups, numbers: Sequence[int], box: np.ndarray) -> list
             texels = needed_texels(inside, name, head.rows, head.columns)
             found[key] = found[key] | texels if key in found else texels
             places[-1][entry.scale, name] = key
-    return [{place: found[key] for place, key in keys.items()} for keys in places]
+    return [{place: found[key] for place, key in keys.items()} or None for keys in places]
 
 
-def _touched_cells(scene: Scene, box: np.ndarray) -> np.ndarray:
-    """Return (Nz, Ny, Nx) bool: the cells that may have a point in the box.
+def touched_cells(scene: Scene, box: np.ndarray) -> np.ndarray:
+    """Return (Nz, Ny, Nx) bool: the cells that may have a point in a box, (2, 3) its corners in world units.
 
     The corners of cells are mapped into the world; a cell is kept if the box around its corners touches `box`.
     """

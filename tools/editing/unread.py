@@ -29,7 +29,7 @@ def without_unread(
     def kept(s: int, name: str, plane: QuantisedPlane) -> QuantisedPlane:
         shape, together = plane.coded.shape, (shared or {}).get((s, name))
         needed = needed_texels(looked_up, name, *shape) if together is None else together
-        if not (plane.coded & ~needed).any():
+        if not (plane.coded & ~needed).any() and (together is None or plane.stores_map):
             return plane
         changed = replace(plane, symbols=plane.symbols * needed[..., None], coded=plane.coded & needed)
         changed = replace(changed, stores_map=plane.stores_map or together is not None)
