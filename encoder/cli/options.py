@@ -342,8 +342,8 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
         "--group",
         type=cli.duration_s,
         metavar="10s",
-        help="code a long clip in groups that show at most so long each, one after the other: encoding and playing "
-        "take the memory of one; --steps are those of the first group",
+        help="code a long clip in groups that show at most so long each, one after the other: encoding takes "
+        "the memory of one, playing that of two; --steps are those of the first group",
     )
     parser.add_argument(
         "--only",
@@ -393,7 +393,7 @@ def _add_coding_options(parser: argparse.ArgumentParser) -> None:
         type=cli.whole_number,
         metavar="N",
         help="steps of fine-tuning after each group of planes is coded, in which the others learn to compensate its "
-        "errors: files are about a tenth smaller, and take a minute or two longer (default, by preset: "
+        "errors: files are 2 to 13 % smaller, and take two or three minutes longer (default, by preset: "
         f"{tune_steps}; {TrainConfig().tune_steps} where nothing is trained; fewer after short training)",
     )
 

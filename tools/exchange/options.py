@@ -110,11 +110,11 @@ def _add_geometry(group: argparse._ArgumentGroup) -> None:
         help="points: size of the pictures of each of the scene's cameras that they are taken from; cameras that are "
         "read: size of their pictures; the vertical field of view stays the same",
     )  # fmt: skip
-    group.add_argument("--backend", choices=("gl", "reference"), default="gl", help="points: as of kprender")
+    group.add_argument("--backend", choices=("gl", "reference"), default="gl", help="points: as for kprender")
     group.add_argument(
-        "--quality", choices=tuple(LEVELS), default="reference", help="points: as of kprender (default: %(default)s)"
+        "--quality", choices=tuple(LEVELS), default="reference", help="points: as for kprender (default: %(default)s)"
     )
-    group.add_argument("--appearance", metavar="NAME|A:B:0.3", help="points: as of kprender")
+    group.add_argument("--appearance", metavar="NAME|A:B:0.3", help="points: as for kprender")
 
 
 def parse(argv: list[str]) -> tuple[argparse.Namespace, Task]:
