@@ -239,6 +239,16 @@ def test_a_box_that_is_empty_in_all_groups_is_refused(clip, capsys):
         assert "--box: there is nothing from [50.0, 50.0, 50.0] to [51.0, 51.0, 51.0]" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("axis", "xyz")
+@pytest.mark.parametrize("name", ["predictive-time-empty", "time-empty", "transform-implied", "predictive-implied"])
+def test_files_of_all_codecs_survive_a_turn(name, axis):
+    """Time planes that store nothing, but change places with those of other sizes, too."""
+    reader = SceneReader(VECTORS / f"{name}.kpc")
+    expected = placed(read(reader), Placement(axis_turn(axis, 90), 1.0, np.zeros(3)))
+    found = read(edited(reader, lambda scene: placed(scene, Placement(axis_turn(axis, 90), 1.0, np.zeros(3)))))
+    assert symbols_equal(found, expected) and np.array_equal(found.occupancy, expected.occupancy)
+
+
 @pytest.mark.parametrize("name", ["transform", "transform-implied", "predictive-implied", "trellis"])
 def test_files_of_all_codecs_survive_a_crop(name):
     reader = SceneReader(VECTORS / f"{name}.kpc")

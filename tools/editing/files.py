@@ -54,11 +54,15 @@ def _place_in(chunk: Chunk | Entry) -> Place:
 
 
 def _reads_the_same_map(reader: SceneReader, number: int, before: QuantisedScene, after: QuantisedScene) -> bool:
-    """Return whether a chunk decodes in both scenes to the same: whether its map does not depend on the occupancy, or
-    both imply the same map."""
+    """Return whether a chunk decodes in both scenes to the same: whether it is no plane, or one of as many texels whose
+    map does not depend on the occupancy, or of which both imply the same map."""
     entry = reader.index[number]
-    if entry.codec not in (Codec.PREDICTIVE, Codec.TRANSFORM) or not needs_occupancy(reader.stored(number)):
+    if entry.kind != "PLNE":
         return True
     name = ALL_PLANES[entry.plane]
-    shape = before.scales[entry.scale][name].coded.shape
+    shape, now = (scene.scales[entry.scale][name].coded.shape for scene in (before, after))
+    if shape != now:  # though neither stores a symbol, so that their contents are alike
+        return False
+    if entry.codec not in (Codec.PREDICTIVE, Codec.TRANSFORM) or not needs_occupancy(reader.stored(number)):
+        return True
     return np.array_equal(needed_texels(before.occupancy, name, *shape), needed_texels(after.occupancy, name, *shape))
