@@ -20,7 +20,7 @@ from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Clip, Scene
 from kpc.tools.editing.cropping import shared_texels, touched_cells, with_cells
 from kpc.tools.editing.files import edited
-from kpc.tools.editing.layers import Layer, Packed, find_layer
+from kpc.tools.editing.layers import Layer, OpenScene, Packed, find_layer
 from kpc.tools.editing.placing import Placement, placed, placed_metadata
 from kpc.tools.editing.timing import at_rate, at_speed, check_part, check_rate, check_speed, spans_at_rate, trimmed
 from kpc.tools.editing.unread import SharedTexels
@@ -81,7 +81,7 @@ def edit(source: Path, output: Path, edits: Edits, metadata: Metadata) -> tuple[
         if edits.part_s is not None:
             scene, span_s = trimmed(scene, *edits.part_s)
             kept.append(span_s)
-        cells = None if layer is None and edits.box is None else _kept_cells(scene.dequantise(), layer, edits)
+        cells = _kept_cells(scene.dequantise, layer, edits)
         if cells is not None and not cells.any():
             raise _nothing(edits)
         return _retimed(_changed(scene, edits, cells), edits)
@@ -123,9 +123,7 @@ def _edit_groups(
     layers = _layers(clip, numbers, edits)
 
     def cells_of(k: int) -> np.ndarray | None:
-        if layers[k] is None and edits.box is None:
-            return None
-        return _kept_cells(PartialScene(clip.open(numbers[k])).scene, layers[k], edits)
+        return _kept_cells(lambda: PartialScene(clip.open(numbers[k])).scene, layers[k], edits)
 
     if not any((cells := cells_of(k)) is None or cells.any() for k in range(len(numbers))):
         raise _nothing(edits)
@@ -162,10 +160,12 @@ def _opened(clip: groups.Groups, number: int) -> Scene:
     return read(clip.open(number)).dequantise()
 
 
-def _kept_cells(scene: Scene, layer: Packed | None, edits: Edits) -> np.ndarray:
-    """Return the cells that are kept, (K, Nz, Ny, Nx) bool."""
-    cells = scene.occupancy if layer is None else layer.array()
-    return cells if edits.box is None else cells & touched_cells(scene, edits.box)
+def _kept_cells(open_scene: OpenScene, layer: Packed | None, edits: Edits) -> np.ndarray | None:
+    """Return the cells of a scene that are kept, (K, Nz, Ny, Nx) bool; None where all are."""
+    if edits.box is None:
+        return None if layer is None else layer.array()
+    scene = open_scene()
+    return (scene.occupancy if layer is None else layer.array()) & touched_cells(scene, edits.box)
 
 
 def _nothing(edits: Edits) -> UsageError:

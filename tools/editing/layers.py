@@ -258,9 +258,10 @@ def _opacities(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 
 def _can_change(scene: Scene) -> np.ndarray:
-    """Return the cells, (Nz, Ny, Nx) bool, in which a scale that changes over the clip has features."""
+    """Return the cells, (Nz, Ny, Nx) bool, that are not occupied in all slots alike, or in which a scale that changes
+    over the clip has features; all where a motion grid displaces points."""
     shape = scene.occupancy.shape[1:]
-    found = np.full(shape, len(scene.occupancy) > 1 or scene.motion is not None)
+    found = (scene.occupancy != scene.occupancy[0]).any(axis=0) | (scene.motion is not None)
     for scale in scene.scales if scene.is_dynamic else ():
         if all((scale[name] == 1).all() for name in TIME_PLANES):
             continue
